@@ -1,0 +1,14 @@
+"""The root of all errors that a user may see: one clear line, no traceback."""
+
+
+class BenchError(Exception):
+    """Something the user can act on. The message says what was wrong, where, and what to do."""
+
+
+class DatasetError(BenchError):
+    """A dataset file cannot be written, opened or trusted."""
+
+
+def unknown_name(kind: str, name: str, known: list[str]) -> str:
+    """The message for a name that does not exist: always lists what does."""
+    return f"unknown {kind} {name!r}; known: {', '.join(sorted(known))}"

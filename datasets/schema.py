@@ -1,0 +1,125 @@
+"""The layout of a dataset file (HDF5), and the record of where its numbers come from.
+
+    /                                   root attributes: format, and every field of `Metadata`
+    /meshes/<hash>/                     rest_positions, cells, cell_type, node_type; each mesh once
+    /trajectories/<key>/                attributes: content_hash
+        positions                       [frames, nodes, dim] float32, one gzip + shuffle chunk
+        mesh                            hard link to /meshes/<hash>
+        material                        group; attributes are the parameters
+        loads/<name>                    arrays, may be absent
+        collider_positions              [frames, collider_nodes, dim] float32, may be absent
+        diagnostics                     group; attributes are what the solver reports
+    /splits/<task>/<train|validation|test>   keys of the trajectories, in order
+
+A key is <split>_<index>, e.g. test_00012. The file's content hash covers the trajectories' content hashes,
+so it does not depend on compression, on the HDF5 library or on the order of writing.
+"""
+
+import json
+from typing import Any, Literal, get_args
+
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
+from pydantic import BaseModel, ConfigDict
+
+FORMAT = "m3gn-bench dataset"
+SCHEMA_VERSION = 1
+
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+Tier = Literal["smoke", "quick", "paper"]
+TIERS: tuple[Tier, ...] = get_args(Tier)
+SMALL_TIERS: dict[str, dict[Split, int]] = {
+    "smoke": {"train": 8, "validation": 4, "test": 4},
+    "quick": {"train": 64, "validation": 16, "test": 16},
+}
+
+
+class Record(BaseModel):
+    """Base of all records: unknown fields are errors, and records do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Rejection(Record):
+    """A draw that was not kept."""
+
+    key: str
+    attempt: int
+    reason: str
+
+
+class Metadata(Record):
+    """Root attributes of a dataset file.
+
+    Units are named, e.g. length_unit "mm". Models see (positions - scale_centre) / scale_length, which maps
+    the scene into [-1, 1].
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    scene: str
+    dataset_version: str
+    tier: Tier
+    paper_sizes: dict[Split, int]
+    generator_version: str
+    simulator_versions: dict[str, str]
+    fidelity: str
+    seed: int
+    dt: float
+    time_unit: str
+    length_unit: str
+    material_units: dict[str, str]
+    load_units: dict[str, str]
+    frames: int
+    scale_centre: tuple[float, ...]
+    scale_length: float
+    licence: str = "CC-BY-4.0"
+    content_hash: str = ""
+    rejections: tuple[Rejection, ...] = ()
+
+    @property
+    def dimension(self) -> int:
+        """Number of space dimensions."""
+        return len(self.scale_centre)
+
+    @property
+    def transitions(self) -> int:
+        """Number of steps between frames: one less than frames."""
+        return self.frames - 1
+
+    def to_attributes(self) -> dict[str, Any]:
+        """HDF5 attributes: scalars as they are, everything else as JSON."""
+        dumped = self.model_dump(mode="json")
+        plain = {k: v if isinstance(v, str | int | float) else json.dumps(v) for k, v in dumped.items()}
+        return {"format": FORMAT, **plain}
+
+    @classmethod
+    def from_attributes(cls, attributes: dict[str, Any]) -> "Metadata":
+        """The inverse of `to_attributes`; raises pydantic's ValidationError on anything unexpected."""
+        values: dict[str, Any] = {}
+        for name, value in attributes.items():
+            if name == "format":
+                continue
+            if isinstance(value, str) and value[:1] in "{[":
+                value = json.loads(value)
+            values[name] = value.item() if hasattr(value, "item") else value
+        return cls.model_validate(values)
+
+
+def tier_sizes(tier: str, paper_sizes: dict[Split, int]) -> dict[Split, int]:
+    """Trajectories per split of a tier. Raises DatasetError for an unknown tier, listing the known ones."""
+    if tier == "paper":
+        return paper_sizes
+    if tier not in SMALL_TIERS:
+        raise DatasetError(unknown_name("tier", tier, list(TIERS)))
+    return SMALL_TIERS[tier]
+
+
+def trajectory_key(split: str, index: int) -> str:
+    """The name of trajectory `index` of a split inside a dataset file."""
+    return f"{split}_{index:05d}"
+
+
+def in_tier(key: str, sizes: dict[Split, int]) -> bool:
+    """Whether the trajectory belongs to a tier of the given sizes (tiers are prefixes of one another)."""
+    split, _, index = key.rpartition("_")
+    return int(index) < {str(name): size for name, size in sizes.items()}.get(split, 0)

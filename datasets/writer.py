@@ -1,0 +1,139 @@
+"""Write trajectories: one shard file each, later merged into one dataset file by a single writer.
+
+Every file appears under its final name only when it is complete: it is written under a temporary name,
+flushed to disk and renamed. A killed run leaves whole shards (the next run goes on from them), never half
+a file under a name that anybody reads.
+"""
+
+import io
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.schema import Metadata, Rejection, Split
+from m3gn_bench.datasets.trajectory import Trajectory, combine_hashes, hash_arrays
+
+COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that becomes `path` on success and vanishes on failure.
+
+    Raises:
+        DatasetError: the operating system refuses (no space, no permission), in one line.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise DatasetError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes_atomically(path: Path, content: bytes) -> None:
+    """Write a whole file or nothing."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_shard(path: Path, key: str, trajectory: Trajectory, metadata: Metadata) -> str:
+    """Write one trajectory as a dataset file of its own and return its content hash."""
+    buffer = io.BytesIO()  # in memory first: a full disk then is an ordinary OSError, not an HDF5 one
+    with h5py.File(buffer, "w") as file:
+        digest = _write_trajectory(file, key, trajectory)
+        file.attrs.update(metadata.model_copy(update={"content_hash": digest}).to_attributes())
+    write_bytes_atomically(path, buffer.getvalue())
+    return digest
+
+
+def _write_trajectory(file: h5py.File, key: str, trajectory: Trajectory) -> str:
+    mesh_arrays = trajectory.mesh.arrays()
+    mesh_name = f"meshes/{hash_arrays(mesh_arrays).hexdigest()[:16]}"
+    for name, array in mesh_arrays.items():
+        _write_array(file, f"{mesh_name}/{name}", array)
+    group = file.create_group(f"trajectories/{key}")
+    group["mesh"] = file[mesh_name]
+    for name, array in trajectory.arrays().items():
+        if not name.startswith("mesh/"):
+            _write_array(group, name, array)
+    group.create_group("material").attrs.update(trajectory.material)
+    group.create_group("diagnostics").attrs.update(trajectory.diagnostics)
+    digest = trajectory.content_hash()
+    group.attrs["content_hash"] = digest
+    return digest
+
+
+def _write_array(group: h5py.Group, name: str, array: np.ndarray) -> None:
+    options = {"chunks": array.shape, **COMPRESSION} if array.ndim and array.size else {}
+    group.create_dataset(name, data=array, **options)
+
+
+def merge_shards(
+    path: Path,
+    shards: dict[str, Path],
+    metadata: Metadata,
+    tasks_of: Callable[[Split, dict[str, float]], list[str]],
+) -> str:
+    """Merge shards into one dataset file and return its content hash.
+
+    Args:
+        path: the dataset file to make.
+        shards: file of every trajectory key, in the order of the splits.
+        metadata: root attributes; content hash and rejections are filled in here.
+        tasks_of: the tasks in whose split of the same name a trajectory with this material takes part.
+    """
+    hashes: dict[str, str] = {}
+    members: dict[str, list[str]] = {}
+    rejections: list[Rejection] = []
+    # HDF5 reports a full disk late and in its own words, so ask the file system first.
+    needed = sum(shard.stat().st_size for shard in shards.values())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stats = os.statvfs(path.parent)
+    if stats.f_bavail * stats.f_frsize < needed:
+        raise DatasetError(f"cannot write {path}: {needed >> 20} MiB needed, less is free in {path.parent}")
+
+    with atomic_path(path) as temporary, _hdf5_errors(path), h5py.File(temporary, "w", libver="v110") as file:
+        file.create_group("meshes")
+        file.create_group("trajectories")
+        for key, shard in shards.items():
+            with h5py.File(shard) as source:
+                (mesh_name,) = source["meshes"]
+                if mesh_name not in file["meshes"]:
+                    source.copy(f"meshes/{mesh_name}", file["meshes"])
+                origin = source[f"trajectories/{key}"]
+                group = file.create_group(f"trajectories/{key}")
+                group.attrs.update(origin.attrs)
+                for name in origin:
+                    if name != "mesh":
+                        source.copy(origin[name], group, name)
+                group["mesh"] = file[f"meshes/{mesh_name}"]
+                hashes[key] = str(origin.attrs["content_hash"])
+                split, _, _ = key.rpartition("_")
+                for task in tasks_of(split, dict(origin["material"].attrs)):  # type: ignore[arg-type]
+                    members.setdefault(f"splits/{task}/{split}", []).append(key)
+                rejections += Metadata.from_attributes(dict(source.attrs)).rejections
+        for name, keys in members.items():
+            file.create_dataset(name, data=keys, dtype=h5py.string_dtype())
+        content_hash = combine_hashes(hashes)
+        complete = metadata.model_copy(update={"content_hash": content_hash, "rejections": tuple(rejections)})
+        file.attrs.update(complete.to_attributes())
+    return content_hash
+
+
+@contextmanager
+def _hdf5_errors(path: Path) -> Iterator[None]:
+    """HDF5 raises RuntimeError for a failed write-back; make it the OSError that it is."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(f"HDF5 could not write {path.name} ({error})") from error

@@ -1,0 +1,255 @@
+"""Make a dataset: draw, simulate, check, shard, merge. Resumable, and the same for any number of workers."""
+
+import os
+import shutil
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+
+import numpy as np
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
+from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
+from m3gn_bench.datasets.schema import SPLITS, Metadata, Rejection, Split, tier_sizes, trajectory_key
+from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.datasets.writer import merge_shards, write_shard
+from m3gn_bench.generators.errors import GeneratorError, SolverError
+from m3gn_bench.generators.scene import Fidelity, Scene, get_scene
+from threadpoolctl import threadpool_limits
+
+from m3gn_bench.version import __version__
+
+DATASET_SEED = 2025
+MAX_ATTEMPTS = 10
+
+
+@dataclass(frozen=True)
+class GenerationReport:
+    """What `generate` made."""
+
+    file: Path
+    content_hash: str
+    trajectories: int
+    rejected: list[Rejection]
+    cpu_seconds_per_trajectory: float
+    generated: int  # now; the others were found from an earlier run
+
+
+def draw(scene: Scene, split: Split, index: int, seed: int, attempt: int = 0) -> object:
+    """Parameters of trajectory `index` of a split: the same whatever else is made, by whom, in what order."""
+    entropy = [seed, zlib.crc32(scene.name.encode()), SPLITS.index(split), index]
+    if attempt:
+        entropy.append(attempt)
+    return scene.sample(np.random.default_rng(np.random.SeedSequence(entropy)), index)
+
+
+def simulate_one(
+    scene: Scene, split: Split, index: int, *, seed: int = DATASET_SEED, fidelity: Fidelity = "default"
+) -> tuple[Trajectory, list[Rejection]]:
+    """Simulate one trajectory, redrawing its parameters where the solver or a check rejects them.
+
+    Returns the trajectory (its CPU seconds among the diagnostics) and the rejected draws.
+
+    Raises:
+        GeneratorError: ten draws in a row were rejected.
+    """
+    rejected: list[Rejection] = []
+    for attempt in range(MAX_ATTEMPTS):
+        start = time.process_time()
+        try:
+            # One thread: the order of floating-point sums must not depend on the machine's core count.
+            with threadpool_limits(1):
+                trajectory = scene.simulate(draw(scene, split, index, seed, attempt), fidelity)
+            problems = scene.check(trajectory)
+        except SolverError as error:
+            problems = [str(error)]
+        else:
+            if not problems:
+                seconds = time.process_time() - start
+                return replace(
+                    trajectory, diagnostics={**trajectory.diagnostics, "cpu_seconds": seconds}
+                ), rejected
+        rejected.append(
+            Rejection(key=trajectory_key(split, index), attempt=attempt, reason="; ".join(problems))
+        )
+    raise GeneratorError(
+        f"{trajectory_key(split, index)}: all {MAX_ATTEMPTS} draws were rejected, the last because {problems[0]}"
+    )
+
+
+def dataset_name(scene: str, tier: str, splits: Sequence[str], fidelity: str) -> str:
+    """File name of a dataset: whatever is not the default is part of it."""
+    parts = [scene, tier]
+    if set(splits) != set(SPLITS):
+        parts += [split for split in SPLITS if split in splits]
+    if fidelity != "default":
+        parts.append(fidelity)
+    return "-".join(parts) + ".h5"
+
+
+def generate(
+    scene_name: str,
+    tier: str,
+    out: Path,
+    *,
+    workers: int = 1,
+    splits: Sequence[Split] = SPLITS,
+    fidelity: Fidelity = "default",
+    seed: int = DATASET_SEED,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> GenerationReport:
+    """Generate a dataset file, or complete one that an earlier run left unfinished.
+
+    Args:
+        scene_name: which scene.
+        tier: "smoke", "quick" or "paper"; smaller tiers are prefixes of larger ones.
+        out: folder for the file and, until it is complete, for its shards.
+        workers: processes.
+        splits: which splits to make.
+        fidelity: "fast", "default" or "reference".
+        seed: of the dataset; leaderboards use the default.
+        on_progress: called with (done, total) after every trajectory.
+
+    Raises:
+        GeneratorError: unknown names, or a trajectory that cannot be made.
+        DatasetError: the folder cannot be written.
+    """
+    scene = get_scene(scene_name)
+    if fidelity not in scene.fidelities:
+        raise GeneratorError(unknown_name("fidelity", fidelity, list(scene.fidelities)))
+    if workers < 1:
+        raise GeneratorError(f"workers must be at least 1, not {workers}")
+    metadata = _metadata(scene, tier, fidelity, seed)
+    path = out / dataset_name(scene_name, tier, splits, fidelity)
+    shard_folder = out / f".{scene_name}-{fidelity}-seed{seed}.shards"
+    sizes = tier_sizes(tier, scene.paper_sizes)
+    wanted: dict[str, tuple[Split, int]] = {
+        trajectory_key(split, i): (split, i)
+        for split in SPLITS
+        if split in splits
+        for i in range(sizes[split])
+    }
+    shards = {key: shard_folder / f"{key}.h5" for key in wanted}
+    with _writable(shard_folder):
+        todo = [key for key in wanted if not _is_complete(shards[key], key, metadata)]
+    done = len(wanted) - len(todo)
+    on_progress(done, len(wanted))
+    jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
+    for _ in _run(jobs, workers):
+        done += 1
+        on_progress(done, len(wanted))
+
+    content_hash = merge_shards(path, shards, metadata, scene.tasks_of)
+    with open_file(path) as file:
+        rejections = list(read_metadata(file).rejections)
+        seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
+    shutil.rmtree(shard_folder)
+    return GenerationReport(path, content_hash, len(wanted), rejections, float(np.mean(seconds)), len(todo))
+
+
+def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadata:
+    tier_sizes(tier, scene.paper_sizes)  # an unknown tier is refused here, by name
+    return Metadata(
+        scene=scene.name,
+        dataset_version=scene.dataset_version,
+        tier=tier,  # type: ignore[arg-type]
+        paper_sizes=scene.paper_sizes,
+        generator_version=__version__,
+        simulator_versions=scene.simulator_versions(),
+        fidelity=fidelity,
+        seed=seed,
+        dt=scene.dt,
+        time_unit=scene.time_unit,
+        length_unit=scene.length_unit,
+        material_units=scene.material_units,
+        load_units=scene.load_units,
+        frames=scene.frames,
+        scale_centre=scene.scale_centre,
+        scale_length=scene.scale_length,
+    )
+
+
+@contextmanager
+def _writable(folder: Path) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+        yield
+    except OSError as error:
+        raise DatasetError(f"cannot write to {folder.parent}: {error.strerror or error}") from error
+
+
+def _is_complete(shard: Path, key: str, metadata: Metadata) -> bool:
+    """Whether an earlier run left this trajectory whole and made by the same generator."""
+    if not shard.is_file():
+        return False
+    try:
+        with open_file(shard) as file:
+            found = read_metadata(file)
+            read_trajectory(file, key)
+    except DatasetError:
+        return False
+    own = {"tier", "content_hash", "rejections"}
+    return found.model_dump(exclude=own) == metadata.model_dump(exclude=own)
+
+
+_Job = tuple[Path, str, Split, int, Metadata]
+
+
+def _make_shard(job: _Job) -> None:
+    path, key, split, index, metadata = job
+    trajectory, rejected = simulate_one(
+        get_scene(metadata.scene),
+        split,
+        index,
+        seed=metadata.seed,
+        fidelity=metadata.fidelity,  # type: ignore[arg-type]
+    )
+    write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
+
+
+def _run(jobs: Iterator[_Job], workers: int) -> Iterator[None]:
+    """Run the jobs, yielding once per finished one; a failure or an interrupt stops the rest at once."""
+    if workers == 1:
+        for job in jobs:
+            yield _make_shard(job)
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_exit_with_parent)
+    try:
+        pending: set[Future[None]] = set()
+        for job in jobs:
+            pending.add(pool.submit(_make_shard, job))
+            if len(pending) >= 2 * workers:
+                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield future.result()
+        for future in pending:
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise GeneratorError(
+            "a worker process died (out of memory, or killed); run the same command again to go on"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _exit_with_parent() -> None:
+    """A worker whose parent was killed would wait for work forever: end with it instead."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

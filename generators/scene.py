@@ -1,0 +1,67 @@
+"""What a scene is, and which scenes there are."""
+
+from importlib import import_module
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.generators.errors import GeneratorError
+
+Fidelity = Literal["fast", "default", "reference"]
+
+
+class Scene(Protocol):
+    """A physical set-up: how to draw its parameters, how to simulate it, what a valid trajectory is."""
+
+    name: ClassVar[str]
+    dataset_version: ClassVar[str]  # raised whenever any number in the dataset changes
+    tasks: ClassVar[tuple[str, ...]]  # the benchmark tasks that split this scene's trajectories
+    paper_sizes: ClassVar[dict[Split, int]]
+    frames: ClassVar[int]
+    dt: ClassVar[float]
+    time_unit: ClassVar[str]
+    length_unit: ClassVar[str]
+    material_units: ClassVar[dict[str, str]]
+    load_units: ClassVar[dict[str, str]]
+    scale_centre: ClassVar[tuple[float, ...]]
+    scale_length: ClassVar[float]
+    fidelities: ClassVar[dict[str, Any]]
+
+    def sample(self, rng: np.random.Generator, index: int) -> Any:
+        """Draw parameters. Factors that a split must cover evenly cycle with `index`."""
+        ...
+
+    def simulate(self, parameters: Any, fidelity: Fidelity) -> Trajectory:
+        """Simulate; raises SolverError where no solution is found."""
+        ...
+
+    def check(self, trajectory: Trajectory) -> list[str]:
+        """Reasons why the trajectory must not enter a dataset; empty if it may."""
+        ...
+
+    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
+        """The tasks in whose `split` a trajectory with this material takes part."""
+        ...
+
+    def simulator_versions(self) -> dict[str, str]:
+        """Versions of the libraries whose code shapes the numbers."""
+        ...
+
+
+# Imported on demand: a scene loads only the simulator that it needs.
+_SCENES = {"sheet_deformation": "m3gn_bench.generators.sheet_deformation:SheetDeformation"}
+
+
+def scene_names() -> list[str]:
+    """All scenes."""
+    return list(_SCENES)
+
+
+def get_scene(name: str) -> Scene:
+    """The scene of that name. Raises GeneratorError listing all scenes if there is none."""
+    if name not in _SCENES:
+        raise GeneratorError(unknown_name("scene", name, scene_names()))
+    module, attribute = _SCENES[name].split(":")
+    return getattr(import_module(module), attribute)()

@@ -1,0 +1,142 @@
+"""Result records: one JSON file per track, task, model and seed, with every test trajectory's error."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.datasets.writer import write_bytes_atomically
+from pydantic import ValidationError
+
+from m3gn_bench.checkpoint import Checkpoint
+from m3gn_bench.metrics import TrajectoryErrors, confidence_interval
+
+HOME = Path(__file__).parent
+RECORD_SCHEMA = 1
+HASH_DIGITS = 16  # of a trajectory's content hash, enough to tell trajectories apart
+
+
+class ContextResult(Record):
+    """Errors at one context size; scaled units, frames after the anchor.
+
+    Attributes:
+        context: number of context frames.
+        mse: full-rollout MSE over all nodes, mean over trajectories.
+        mse_free_nodes: the same without fixed nodes.
+        ci95: bootstrap interval of `mse`.
+        per_timestep_mse: mean over trajectories, for every frame after the anchor.
+        trajectory_mse: `mse` of every trajectory.
+        trajectory_mse_free_nodes: `mse_free_nodes` of every trajectory.
+    """
+
+    context: int
+    mse: float
+    mse_free_nodes: float
+    ci95: tuple[float, float]
+    per_timestep_mse: tuple[float, ...]
+    trajectory_mse: tuple[float, ...]
+    trajectory_mse_free_nodes: tuple[float, ...]
+
+    @classmethod
+    def from_errors(cls, context: int, errors: TrajectoryErrors) -> "ContextResult":
+        """Summarise the errors of all trajectories."""
+        return cls(
+            context=context,
+            mse=float(errors.mse.mean()),
+            mse_free_nodes=float(errors.mse_free_nodes.mean()),
+            ci95=confidence_interval(errors.mse),
+            per_timestep_mse=tuple(errors.per_timestep_mse.mean(0).tolist()),
+            trajectory_mse=tuple(errors.mse.tolist()),
+            trajectory_mse_free_nodes=tuple(errors.mse_free_nodes.tolist()),
+        )
+
+
+class ResultRecord(Record):
+    """One row of the leaderboard and everything needed to re-derive it."""
+
+    record_schema: int = RECORD_SCHEMA
+    track: str
+    task: str
+    model: str
+    preset: str
+    seed: int
+    parameters: int
+    tier: str
+    split: str
+    dataset_hash: str  # of the trajectories evaluated on
+    keys: tuple[str, ...]
+    trajectory_hashes: tuple[str, ...]
+    package_version: str
+    commit: str | None
+    evaluation_device: str
+    evaluation_seconds: float
+    checkpoint: Checkpoint
+    results: tuple[ContextResult, ...]
+
+    @property
+    def name(self) -> str:
+        """Identifies the record within a task."""
+        return f"{self.model}-{self.preset}-s{self.seed}"
+
+    def result(self, context: int) -> ContextResult | None:
+        """The result at a context size, if recorded."""
+        return next((r for r in self.results if r.context == context), None)
+
+    def mse_over(self, context: int, keys: Sequence[str]) -> float | None:
+        """Mean recorded error over some of the trajectories; None unless all of them were recorded."""
+        result = self.result(context)
+        if result is None or not keys or not set(keys) <= set(self.keys):
+            return None
+        errors = dict(zip(self.keys, result.trajectory_mse, strict=True))
+        return float(np.mean([errors[key] for key in keys]))
+
+
+def record_path(record: ResultRecord, home: Path = HOME) -> Path:
+    """Where a record belongs."""
+    return home / "records" / record.track / record.task / f"{record.name}.json"
+
+
+def checkpoint_folder(task: str, model: str, preset: str, seed: int = 0, home: Path = HOME) -> Path:
+    """Where the reference checkpoint that ships with the project lies."""
+    return home / "checkpoints" / task / f"{model}-{preset}-s{seed}"
+
+
+def write_record(record: ResultRecord, home: Path = HOME) -> Path:
+    """Write a record to its place, numbers rounded to nine digits."""
+    path = record_path(record, home)
+    rounded = _rounded(record.model_dump(mode="json"))
+    write_bytes_atomically(path, (json.dumps(rounded, indent=1) + "\n").encode())
+    return path
+
+
+def _rounded(value: object) -> object:
+    if isinstance(value, float):
+        return float(f"{value:.9g}")
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return value
+
+
+def read_records(home: Path = HOME) -> list[ResultRecord]:
+    """All records, sorted by track, task and name. Raises BenchError naming a file that is none."""
+    records = []
+    for path in sorted((home / "records").rglob("*.json")):
+        try:
+            records.append(ResultRecord.model_validate_json(path.read_bytes()))
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise BenchError(f"{path} is no valid result record: {place}: {first['msg']}") from error
+    return records
+
+
+def find_record(
+    records: Sequence[ResultRecord], task: str, model: str, preset: str, seed: int
+) -> ResultRecord | None:
+    """The record of a run, if there is one."""
+    wanted = (task, model, preset, seed)
+    return next((r for r in records if (r.task, r.model, r.preset, r.seed) == wanted), None)

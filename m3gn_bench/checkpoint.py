@@ -1,0 +1,104 @@
+"""Save and load trained models: safetensors for numbers, JSON for everything else, no pickles.
+
+A checkpoint is a folder of two files: `weights.safetensors` and `checkpoint.json`, which says what the
+weights belong to and carries their SHA-256.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import safetensors
+from pydantic import ValidationError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.datasets.writer import write_bytes_atomically
+from m3gn_bench.errors import CheckpointError
+from m3gn_bench.model import Model, RunConfig, build_model
+from m3gn_bench.tasks import get_task
+
+WEIGHTS, DESCRIPTION = "weights.safetensors", "checkpoint.json"
+
+
+class Checkpoint(Record):
+    """What `checkpoint.json` says.
+
+    Attributes:
+        minutes: training time (on a CPU: CPU time of training steps).
+        validation_error: mean full-rollout MSE over context sizes of the kept weights; None if not trained.
+        dataset_hash: content hash of the data trained on (training and validation split).
+    """
+
+    task: str
+    seed: int
+    config: dict[str, Any]
+    config_hash: str
+    steps: int
+    best_step: int
+    minutes: float
+    validation_error: float | None
+    dataset_hash: str
+    device: str
+    threads: int
+    package_version: str
+    weights_sha256: str = ""
+
+
+def save_checkpoint(folder: Path, weights: dict[str, Tensor], description: Checkpoint) -> None:
+    """Write a checkpoint; the description comes last, so a folder that has one is complete."""
+    content = save({name: value.contiguous() for name, value in weights.items()})
+    complete = description.model_copy(update={"weights_sha256": hashlib.sha256(content).hexdigest()})
+    write_bytes_atomically(folder / WEIGHTS, content)
+    write_bytes_atomically(folder / DESCRIPTION, (complete.model_dump_json(indent=2) + "\n").encode())
+
+
+def read_description(folder: Path) -> Checkpoint:
+    """The description of a checkpoint. Raises CheckpointError if there is none or it is damaged."""
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        raise CheckpointError(
+            f"no checkpoint in {folder} ({DESCRIPTION} is missing); make one with 'm3gn-bench train'"
+        )
+    try:
+        return Checkpoint.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise CheckpointError(f"{path} is damaged: {error.errors()[0]['msg']}") from error
+
+
+def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
+    """The model of a checkpoint, ready to predict.
+
+    Raises:
+        CheckpointError: missing, damaged, or made for another version of the model.
+    """
+    description = read_description(folder)
+    path = folder / WEIGHTS
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror}") from error
+    if hashlib.sha256(content).hexdigest() != description.weights_sha256:
+        raise CheckpointError(
+            f"{path} does not match the SHA-256 in {DESCRIPTION}: it is damaged or was replaced"
+        )
+    try:
+        config = RunConfig.from_json(description.config)
+        model = build_model(config, get_task(description.task))
+        model.load_state_dict(load(content))
+    except (ValidationError, KeyError, RuntimeError, safetensors.SafetensorError) as error:
+        raise CheckpointError(f"{folder} does not fit this version of its model: {error}") from error
+    return model.eval(), description
+
+
+def run_config_record(text: str) -> dict[str, Any]:
+    """Parse the JSON object that a training state carries. Raises CheckpointError if it is none."""
+    try:
+        record = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"the saved training state is damaged: {error}") from error
+    if not isinstance(record, dict):
+        raise CheckpointError("the saved training state is damaged: no JSON object")
+    return record

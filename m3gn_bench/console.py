@@ -1,0 +1,72 @@
+"""How the command line talks: tables and progress for people, one JSON object for programs.
+
+Results go to standard output, progress and errors to standard error. Progress is off where standard error is
+no terminal, and with --json.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+OnProgress = Callable[[int, int], None]
+
+
+class Report:
+    """Where a command puts its result.
+
+    Args:
+        as_json: print one JSON object instead of text.
+    """
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+        self.errors = Console(stderr=True)
+
+    def finish(self, record: dict[str, object], *texts: str | Table) -> None:
+        """Print the record as JSON, or else the texts and tables."""
+        if self.as_json:
+            click.echo(json.dumps(record, indent=2))
+            return
+        console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=not sys.stdout.isatty())
+        for text in texts:
+            console.print(text, highlight=False, markup=False) if isinstance(text, str) else console.print(
+                text
+            )
+
+    @contextmanager
+    def progress(self, description: str) -> Iterator[OnProgress]:
+        """A progress bar, as a function of (done, total)."""
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        shown = self.errors.is_terminal and not self.as_json
+        with Progress(*columns, console=self.errors, disable=not shown, transient=True) as bar:
+            task = bar.add_task(description, total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def table(title: str, columns: list[str], rows: list[list[object]]) -> Table:
+    """A rich table; all columns but the first are right-aligned numbers."""
+    result = Table(title=title, title_justify="left")
+    for number, column in enumerate(columns):
+        result.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+    for row in rows:
+        result.add_row(*("" if value is None else str(value) for value in row))
+    return result

@@ -1,0 +1,200 @@
+"""From stored trajectories to what models see: scaled tensors, and no more of the future than is allowed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.reader import TrajectoryDataset
+from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.trajectory import FIXED, Trajectory
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.tasks import Task
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What is known of one or several deformable bodies and does not change with time.
+
+    Several bodies form a disjoint union: their nodes are concatenated and their edges shifted, so every
+    model handles a batch of trajectories without knowing it.
+
+    Attributes:
+        rest_positions: scaled, shape [nodes, dim].
+        edges: sender and receiver of each directed mesh edge, sorted by receiver, shape [2, edges].
+        static_features: shape [nodes, static].
+        fixed: nodes that never move, shape [nodes], bool.
+        material: scaled material parameters, shape [nodes, materials].
+        node_counts: number of nodes of each body.
+    """
+
+    rest_positions: Tensor
+    edges: Tensor
+    static_features: Tensor
+    fixed: Tensor
+    material: Tensor
+    node_counts: tuple[int, ...]
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of all bodies."""
+        return sum(self.node_counts)
+
+    def body_of_node(self) -> Tensor:
+        """Index of the body that each node belongs to, shape [nodes]."""
+        counts = torch.tensor(self.node_counts, device=self.fixed.device)
+        return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What a model may know when it predicts: nothing of the mesh after the anchor.
+
+    Attributes:
+        body: the bodies.
+        positions: frames 1..T^c, scaled, shape [context_frames, nodes, dim]; the last is the anchor.
+        horizon: number of frames to predict.
+        collider_path: the collider's positions in all frames, shape [frames, collider_nodes, dim], or None.
+    """
+
+    body: Body
+    positions: Tensor
+    horizon: int
+    collider_path: Tensor | None = None
+
+    @property
+    def frames(self) -> int:
+        """Length of the whole trajectory in frames."""
+        return len(self.positions) + self.horizon
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A whole trajectory (or several of the same length) in scaled units, from which contexts are cut.
+
+    Attributes:
+        body: the bodies.
+        positions: shape [frames, nodes, dim].
+        collider_path: shape [frames, collider_nodes, dim], or None.
+        keys: the trajectories' names in the dataset.
+    """
+
+    body: Body
+    positions: Tensor
+    collider_path: Tensor | None
+    keys: tuple[str, ...]
+
+    @property
+    def frames(self) -> int:
+        """Length in frames."""
+        return len(self.positions)
+
+    def context(self, size: int) -> Context:
+        """The context of the first `size` frames. Raises ConfigError if it leaves nothing to predict."""
+        if not 2 <= size < self.frames:
+            raise ConfigError(
+                f"context size {size} is out of range: a trajectory of {self.frames} frames "
+                f"allows 2 to {self.frames - 1}"
+            )
+        return Context(self.body, self.positions[:size], self.frames - size, self.collider_path)
+
+    def future(self, size: int) -> Tensor:
+        """The frames after a context of that size, shape [frames - size, nodes, dim]."""
+        return self.positions[size:]
+
+    def to(self, device: torch.device) -> "Case":
+        """The same case on another device."""
+        moved = {
+            f.name: value.to(device)
+            for f in fields(Body)
+            if isinstance(value := getattr(self.body, f.name), Tensor)
+        }
+        path = None if self.collider_path is None else self.collider_path.to(device)
+        return replace(
+            self, body=replace(self.body, **moved), positions=self.positions.to(device), collider_path=path
+        )
+
+
+def join(cases: Sequence[Case]) -> Case:
+    """Disjoint union of trajectories of equal length."""
+    if len(cases) == 1:
+        return cases[0]
+    bodies = [case.body for case in cases]
+    offsets = np.cumsum([0] + [body.nodes for body in bodies[:-1]])
+    body = Body(
+        rest_positions=torch.cat([b.rest_positions for b in bodies]),
+        edges=torch.cat([b.edges + int(o) for b, o in zip(bodies, offsets, strict=True)], dim=1),
+        static_features=torch.cat([b.static_features for b in bodies]),
+        fixed=torch.cat([b.fixed for b in bodies]),
+        material=torch.cat([b.material for b in bodies]),
+        node_counts=tuple(n for b in bodies for n in b.node_counts),
+    )
+    paths = [case.collider_path for case in cases if case.collider_path is not None]
+    return Case(
+        body=body,
+        positions=torch.cat([case.positions for case in cases], dim=1),
+        collider_path=torch.cat(paths, dim=1) if paths else None,
+        keys=tuple(key for case in cases for key in case.keys),
+    )
+
+
+def mesh_edges(cells: np.ndarray) -> np.ndarray:
+    """Both directions of every edge of a simplex mesh, sorted by receiver, shape [2, edges]."""
+    corners = cells.shape[1]
+    pairs = np.concatenate([cells[:, [i, j]] for i in range(corners) for j in range(corners) if i != j])
+    unique = np.unique(pairs[:, ::-1], axis=0)  # rows sorted by receiver, then sender
+    return np.ascontiguousarray(unique[:, ::-1].T).astype(np.int64)
+
+
+class Scaling(Protocol):
+    """The map of a scene into [-1, 1]: a dataset's metadata has it, and so has a scene."""
+
+    @property
+    def scale_centre(self) -> tuple[float, ...]: ...
+
+    @property
+    def scale_length(self) -> float: ...
+
+
+def case_from(task: Task, scaling: Scaling, trajectory: Trajectory, key: str) -> Case:
+    """Scale a trajectory to [-1, 1] and add the task's features.
+
+    Raises:
+        DatasetError: the trajectory does not fit the task.
+    """
+    frames, _, dimension = trajectory.positions.shape
+    if (frames, dimension) != (task.frames, task.dimension):
+        raise DatasetError(
+            f"trajectory {key} has {frames} frames in {dimension}-D, but task {task.name} has "
+            f"{task.frames} in {task.dimension}-D"
+        )
+    centre = np.array(scaling.scale_centre)
+
+    def scaled(positions: np.ndarray) -> Tensor:
+        return torch.from_numpy(((positions - centre) / scaling.scale_length).astype(np.float32))
+
+    nodes = len(trajectory.mesh.rest_positions)
+    material = [feature(trajectory.material[feature.name]) for feature in task.material]
+    body = Body(
+        rest_positions=scaled(trajectory.mesh.rest_positions),
+        edges=torch.from_numpy(mesh_edges(trajectory.mesh.cells)),
+        static_features=torch.from_numpy(task.static(trajectory)),
+        fixed=torch.from_numpy(trajectory.mesh.node_type == FIXED),
+        material=torch.tensor(material, dtype=torch.float32).expand(nodes, -1).contiguous(),
+        node_counts=(nodes,),
+    )
+    path = trajectory.collider_positions
+    return Case(body, scaled(trajectory.positions), None if path is None else scaled(path), (key,))
+
+
+def load_cases(path: Path, task: Task, split: Split, tier: str | None = None) -> list[Case]:
+    """All trajectories of a split, in memory (every hash is verified on the way)."""
+    dataset = TrajectoryDataset(path, task.name, split, tier)
+    if not dataset.keys:
+        raise DatasetError(f"{path} holds no {split} trajectories of task {task.name}")
+    return [case_from(task, dataset.metadata, dataset[i], key) for i, key in enumerate(dataset.keys)]

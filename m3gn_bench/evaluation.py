@@ -1,0 +1,47 @@
+"""Score a model: predict from contexts of several sizes and measure the error of every trajectory."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from m3gn_bench.data import Case, join
+from m3gn_bench.metrics import TrajectoryErrors, concatenate, trajectory_errors
+from m3gn_bench.model import Model
+
+BATCH = 16  # trajectories predicted together
+
+
+def evaluate_model(
+    model: Model,
+    cases: Sequence[Case],
+    context_sizes: Sequence[int],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[int, TrajectoryErrors]:
+    """Errors of every trajectory at every context size.
+
+    Args:
+        model: any model, on the cases' device.
+        cases: the trajectories, in the order in which errors are returned.
+        context_sizes: numbers of context frames.
+        on_progress: called with (done, total) after every batch.
+
+    Raises:
+        ConfigError: a context size that the trajectories do not allow.
+    """
+    was_training = model.training
+    model.eval()
+    starts = range(0, len(cases), BATCH)
+    results: dict[int, TrajectoryErrors] = {}
+    done, total = 0, len(starts) * len(context_sizes)
+    with torch.inference_mode():
+        for size in context_sizes:
+            parts = []
+            for start in starts:
+                batch = join(cases[start : start + BATCH])
+                predicted = model.predict(batch.context(size))
+                parts.append(trajectory_errors(batch.body, predicted, batch.future(size)))
+                done += 1
+                on_progress(done, total)
+            results[size] = concatenate(parts)
+    model.train(was_training)
+    return results

@@ -1,0 +1,69 @@
+"""Errors of predicted trajectories, and their confidence intervals.
+
+All errors are mean squared errors per coordinate in scaled units, over the frames after the anchor (paper,
+section 5: full-rollout MSE and per-timestep MSE).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.stats import bootstrap
+from torch import Tensor
+
+from m3gn_bench.data import Body
+
+BOOTSTRAP_RESAMPLES = 9999
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Errors of several trajectories at one context size.
+
+    Attributes:
+        mse: full-rollout MSE over all nodes, shape [trajectories].
+        mse_free_nodes: the same over nodes that are free to move.
+        per_timestep_mse: over all nodes, shape [trajectories, horizon].
+    """
+
+    mse: np.ndarray
+    mse_free_nodes: np.ndarray
+    per_timestep_mse: np.ndarray
+
+
+def trajectory_errors(body: Body, predicted: Tensor, truth: Tensor) -> TrajectoryErrors:
+    """Errors of each body from positions of shape [horizon, nodes, dim]."""
+    squared = (predicted - truth).double().square().mean(-1)
+    all_nodes, free_nodes, per_timestep = [], [], []
+    for error, fixed in zip(
+        squared.split(body.node_counts, 1), body.fixed.split(body.node_counts), strict=True
+    ):
+        all_nodes.append(error.mean())
+        free_nodes.append(error[:, ~fixed].mean())
+        per_timestep.append(error.mean(1))
+    return TrajectoryErrors(
+        *(torch.stack(values).cpu().numpy() for values in (all_nodes, free_nodes, per_timestep))
+    )
+
+
+def concatenate(parts: list[TrajectoryErrors]) -> TrajectoryErrors:
+    """Errors of several batches of trajectories as one."""
+    return TrajectoryErrors(
+        *(np.concatenate([getattr(p, name) for p in parts]) for name in TrajectoryErrors.__dataclass_fields__)
+    )
+
+
+def confidence_interval(errors: np.ndarray) -> tuple[float, float]:
+    """95 % bootstrap interval (percentile) of the mean of per-trajectory errors, the same at every call."""
+    if len(errors) < 2 or np.ptp(errors) == 0:
+        return float(errors.mean()), float(errors.mean())
+    interval = bootstrap(
+        (errors,),
+        np.mean,
+        n_resamples=BOOTSTRAP_RESAMPLES,
+        confidence_level=0.95,
+        method="percentile",
+        batch=500,
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)

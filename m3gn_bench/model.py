@@ -1,0 +1,203 @@
+"""What a model is, which models there are, and the presets that fix their size and training."""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Sequence
+from importlib import resources
+from importlib.metadata import entry_points
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor, nn
+
+from m3gn_bench.data import Case, Context
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.tasks import Task
+
+ENTRY_POINTS = "m3gn_bench.models"
+
+
+class Config(BaseModel):
+    """Base of all configurations: an unknown key is an error, and nothing changes after the start."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TrainingConfig(Config):
+    """How to train; the same loop serves every model.
+
+    The budget is either `minutes` or `steps`. On a CPU minutes are CPU time of the training steps (validation
+    and loading are not counted), so that "10 minutes on one core" means the same on a busy machine.
+    """
+
+    minutes: float | None = Field(default=None, gt=0)
+    steps: int | None = Field(default=None, gt=0)
+    batch_size: int = Field(default=1, ge=1)  # trajectories per step
+    learning_rate: float = Field(default=5e-4, gt=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    cosine_decay: bool = True  # to zero at the end of the budget; constant otherwise
+    weight_decay: float = Field(default=0.0, ge=0)
+    gradient_clip: float | None = Field(default=None, gt=0)  # on the global norm
+    validations: int = Field(default=10, ge=1)  # over the whole budget; the best one is kept
+    validation_trajectories: int = Field(default=18, ge=1)
+
+
+class Model(nn.Module):
+    """Base of all models, learned or not.
+
+    A subclass defines `Config` (its hyper-parameters), `predict`, and either `training_loss` (learned models)
+    or `prepare` alone (models that only need statistics of the training data, or nothing).
+
+    Attributes:
+        velocity_scale, displacement_scale: standard deviations over the training data of free nodes'
+            movement in one step, and since the first frame; they make inputs and outputs of order one.
+    """
+
+    Config: ClassVar[type[Config]] = Config
+    uses_material: ClassVar[bool] = False
+    preset_file: ClassVar[str | None] = None  # in the folder `presets` of the module's package
+
+    velocity_scale: Tensor
+    displacement_scale: Tensor
+
+    def __init__(self, task: Task, config: Config) -> None:
+        super().__init__()
+        self.task = task
+        self.config = config
+        self.register_buffer("velocity_scale", torch.ones(()))
+        self.register_buffer("displacement_scale", torch.ones(()))
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether there are weights to train."""
+        return any(parameter.requires_grad for parameter in self.parameters())
+
+    def parameter_count(self) -> int:
+        """Number of trainable parameters."""
+        return sum(parameter.numel() for parameter in self.parameters() if parameter.requires_grad)
+
+    def prepare(self, cases: Sequence[Case]) -> None:
+        """Take statistics from the training data, before the first step."""
+        steps = [np.diff(c.positions[:, ~c.body.fixed].numpy(), axis=0).ravel() for c in cases]
+        moved = [(c.positions - c.positions[0])[1:, ~c.body.fixed].numpy().ravel() for c in cases]
+        self.velocity_scale.fill_(float(np.concatenate(steps).std(dtype=np.float64)))
+        self.displacement_scale.fill_(float(np.concatenate(moved).std(dtype=np.float64)))
+
+    def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
+        """The loss of one step on a batch of trajectories; all randomness comes from `rng`."""
+        raise NotImplementedError(f"{type(self).__name__} is not trained")
+
+    def predict(self, context: Context) -> Tensor:
+        """Positions in the frames after the anchor, shape [horizon, nodes, dim]."""
+        raise NotImplementedError
+
+
+def hold_fixed(context: Context, positions: Tensor) -> Tensor:
+    """Predicted positions [..., nodes, dim] with the nodes of prescribed position at their place."""
+    return torch.where(context.body.fixed[:, None], context.positions[-1], positions)
+
+
+def model_names() -> list[str]:
+    """All registered models, ours and other packages'."""
+    return sorted(entry.name for entry in entry_points(group=ENTRY_POINTS))
+
+
+def get_model_class(name: str) -> type[Model]:
+    """The class of a registered model. Raises ConfigError listing all models if there is none."""
+    for entry in entry_points(group=ENTRY_POINTS, name=name):
+        return entry.load()
+    raise ConfigError(unknown_name("model", name, model_names()))
+
+
+class RunConfig(BaseModel):
+    """Everything that determines a training run, besides the data and the seed."""
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    model_name: str
+    preset: str
+    model: Config
+    training: TrainingConfig
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return {
+            "model_name": self.model_name,
+            "preset": self.preset,
+            "model": self.model.model_dump(mode="json"),
+            "training": self.training.model_dump(mode="json"),
+        }
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any]) -> "RunConfig":
+        """The inverse of `to_json`."""
+        model = get_model_class(record["model_name"]).Config.model_validate(record["model"])
+        training = TrainingConfig.model_validate(record["training"])
+        return cls(model_name=record["model_name"], preset=record["preset"], model=model, training=training)
+
+    def hash(self) -> str:
+        """SHA-256 of the configuration, without the budget (records name that separately)."""
+        record = self.to_json()
+        for budget in ("minutes", "steps"):
+            del record["training"][budget]
+        return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+PRESETS = ("smoke", "compact", "paper")
+
+
+def load_preset(
+    model_name: str, preset: str, task: Task, overrides: dict[str, Any] | None = None
+) -> RunConfig:
+    """The configuration of a model's preset for a task.
+
+    A preset file is TOML: tables [PRESET.model] and [PRESET.training], and for single tasks
+    [PRESET.task.TASK.model] and [PRESET.task.TASK.training].
+
+    Args:
+        model_name: a registered model.
+        preset: "smoke", "compact" or "paper".
+        task: the task, for its own entries.
+        overrides: values by dotted key, e.g. {"training.learning_rate": 1e-3}.
+
+    Raises:
+        ConfigError: unknown preset or key (the message lists the known ones), or a value out of range.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(unknown_name("preset", preset, list(PRESETS)))
+    model_class = get_model_class(model_name)
+    values: dict[str, dict[str, Any]] = {"model": {}, "training": {}}
+    if model_class.preset_file is not None:
+        package = model_class.__module__.rpartition(".")[0]
+        text = (resources.files(package) / "presets" / model_class.preset_file).read_text()
+        tables = tomllib.loads(text)[preset]
+        for layer in (tables, tables.get("task", {}).get(task.name, {})):
+            for section in values:
+                values[section] |= layer.get(section, {})
+    known = [f"model.{key}" for key in model_class.Config.model_fields]
+    known += [f"training.{key}" for key in TrainingConfig.model_fields]
+    for key, value in (overrides or {}).items():
+        if key not in known:
+            raise ConfigError(unknown_name("configuration key", key, known))
+        section, _, name = key.partition(".")
+        values[section][name] = value
+    try:
+        return RunConfig(
+            model_name=model_name,
+            preset=preset,
+            model=model_class.Config.model_validate(values["model"]),
+            training=TrainingConfig.model_validate(values["training"]),
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"configuration key {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def build_model(config: RunConfig, task: Task, seed: int = 0) -> Model:
+    """A freshly initialised model; the seed fixes its weights."""
+    torch.manual_seed(seed)
+    return get_model_class(config.model_name)(task, config.model)

@@ -1,0 +1,55 @@
+"""Where trajectories come from: a dataset file that is there already, or the generator.
+
+The only module besides the command line that reaches into the generators, and only when called: models and
+evaluation work without a simulator installed.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+from m3gn_bench.data import Case, case_from
+from m3gn_bench.datasets.file import find_dataset
+from m3gn_bench.datasets.schema import SPLITS, Split
+from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.tasks import Task
+
+
+def find_or_generate(
+    task: Task,
+    tier: str,
+    folder: Path,
+    *,
+    splits: Sequence[Split] = SPLITS,
+    workers: int = 1,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """A dataset file in `folder` that holds the task's tier and splits; generated if there is none."""
+    found = find_dataset(folder, task.scene, tier, splits)
+    if found is not None:
+        return found
+    from m3gn_bench.generators.generate import generate
+
+    return generate(task.scene, tier, folder, splits=splits, workers=workers, on_progress=on_progress).file
+
+
+def regenerate(task: Task, keys: Sequence[str]) -> tuple[list[Case], list[str]]:
+    """Simulate single trajectories anew, by their names in the dataset; returns cases and content hashes."""
+    from m3gn_bench.generators.scene import get_scene
+
+    trajectories = [_simulate(task.scene, key) for key in keys]
+    cases = [
+        case_from(task, get_scene(task.scene), trajectory, key)
+        for key, trajectory in zip(keys, trajectories, strict=True)
+    ]
+    return cases, [trajectory.content_hash() for trajectory in trajectories]
+
+
+@lru_cache(maxsize=256)  # several records are checked on the same trajectories
+def _simulate(scene_name: str, key: str) -> Trajectory:
+    from m3gn_bench.generators.generate import simulate_one
+    from m3gn_bench.generators.scene import get_scene
+
+    split, _, index = key.rpartition("_")
+    trajectory, _ = simulate_one(get_scene(scene_name), split, int(index))  # type: ignore[arg-type]
+    return trajectory
