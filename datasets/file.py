@@ -5,10 +5,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import numpy as np
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.schema import FORMAT, SCHEMA_VERSION, SPLITS, Metadata, in_tier, tier_sizes
+from m3gn_bench.datasets.schema import (
+    DATASET_SEED,
+    FORMAT,
+    SCHEMA_VERSION,
+    SPLITS,
+    Metadata,
+    in_tier,
+    tier_sizes,
+)
 from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
-from pydantic import ValidationError
+
+MAX_COMPRESSION = 1100  # gzip reaches 1032
 
 
 def open_file(path: Path) -> h5py.File:
@@ -26,7 +36,8 @@ def open_file(path: Path) -> h5py.File:
             f"{path} cannot be opened as HDF5, it may be truncated or damaged ({error})"
         ) from error
     try:
-        found, version = file.attrs.get("format"), file.attrs.get("schema_version")
+        with damage_as_dataset_error(f"{path}: root attributes"):
+            found, version = file.attrs.get("format"), file.attrs.get("schema_version")
         if found != FORMAT:
             raise DatasetError(f"{path} is HDF5 but no m3gn-bench dataset (attribute 'format' is {found!r})")
         if version != SCHEMA_VERSION:
@@ -43,7 +54,7 @@ def read_metadata(file: h5py.File) -> Metadata:
     """The root attributes. Raises DatasetError if they do not fit the schema."""
     try:
         return Metadata.from_attributes(dict(file.attrs))
-    except (ValidationError, ValueError) as error:
+    except (ValueError, OSError, RuntimeError, KeyError, TypeError) as error:
         first = str(error).splitlines()
         raise DatasetError(
             f"{file.filename} has damaged root attributes: {' '.join(first[1:3]) or error}"
@@ -56,28 +67,49 @@ def read_trajectory(file: h5py.File, key: str) -> Trajectory:
     Raises:
         DatasetError: missing, damaged, or its content does not match its hash.
     """
-    with damage_as_dataset_error(f"{file.filename}: trajectory {key}"):
-        group = file["trajectories"][key]
-        mesh = group["mesh"]
-        trajectory = Trajectory(
-            positions=group["positions"][()],
-            mesh=Mesh(
-                rest_positions=mesh["rest_positions"][()],
-                cells=mesh["cells"][()],
-                cell_type=int(mesh["cell_type"][()]),
-                node_type=mesh["node_type"][()],
-            ),
-            material={name: float(value) for name, value in group["material"].attrs.items()},
-            loads={name: array[()] for name, array in group["loads"].items()} if "loads" in group else {},
-            collider_positions=group["collider_positions"][()] if "collider_positions" in group else None,
-            diagnostics={name: float(value) for name, value in group["diagnostics"].attrs.items()},
-        )
-        stored = group.attrs["content_hash"]
+    trajectory, stored = load_trajectory(file, key)
     if trajectory.content_hash() != stored:
         raise DatasetError(
             f"{file.filename}: trajectory {key} does not match its content hash; generate it again"
         )
     return trajectory
+
+
+def load_trajectory(file: h5py.File, key: str) -> tuple[Trajectory, str]:
+    """A trajectory as it is in the file, and the content hash that it should have.
+
+    Raises:
+        DatasetError: missing or unreadable.
+    """
+    with damage_as_dataset_error(f"{file.filename}: trajectory {key}"):
+        group = file["trajectories"][key]
+        mesh = group["mesh"]
+        trajectory = Trajectory(
+            positions=_array(group, "positions"),
+            mesh=Mesh(
+                rest_positions=_array(mesh, "rest_positions"),
+                cells=_array(mesh, "cells"),
+                cell_type=int(_array(mesh, "cell_type")),
+                node_type=_array(mesh, "node_type"),
+            ),
+            material={name: float(value) for name, value in group["material"].attrs.items()},
+            loads={name: _array(group["loads"], name) for name in group.get("loads", ())},
+            collider_positions=_array(group, "collider_positions") if "collider_positions" in group else None,
+            diagnostics={name: float(value) for name, value in group["diagnostics"].attrs.items()},
+        )
+        return trajectory, str(group.attrs["content_hash"])
+
+
+def _array(group: h5py.Group, name: str) -> np.ndarray:
+    """An array, if its layout is the writer's: a damaged one can ask for more memory than there is."""
+    dataset = group[name]
+    if dataset.chunks not in (None, dataset.shape):
+        raise ValueError(f"{name} of shape {dataset.shape} has chunks {dataset.chunks}")
+    if dataset.nbytes > MAX_COMPRESSION * dataset.id.get_storage_size():
+        raise ValueError(
+            f"{name} of shape {dataset.shape} has {dataset.id.get_storage_size()} bytes in the file"
+        )
+    return dataset[()]
 
 
 @contextmanager
@@ -93,6 +125,15 @@ def stored_hashes(file: h5py.File) -> dict[str, str]:
     """The recorded content hash of every trajectory, by key."""
     with damage_as_dataset_error(f"{file.filename}: the list of trajectories"):
         return {key: str(group.attrs["content_hash"]) for key, group in file["trajectories"].items()}
+
+
+def read_splits(file: h5py.File) -> dict[str, dict[str, list[str]]]:
+    """The keys of the trajectories, in order, by task and split."""
+    with damage_as_dataset_error(f"{file.filename}: the splits"):
+        return {
+            task: {split: [key.decode() for key in _array(group, split)] for split in group}
+            for task, group in file["splits"].items()
+        }
 
 
 def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str] = SPLITS) -> str:
@@ -111,12 +152,13 @@ def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str]
 
 
 def find_dataset(folder: Path, scene: str, tier: str, splits: Sequence[str]) -> Path | None:
-    """The smallest default-fidelity dataset file in a folder that holds the scene's tier and splits, or None."""
+    """The smallest file in a folder that holds the leaderboard's data of a scene, tier and splits, or None."""
     suitable = []
     for path in folder.glob(f"{scene}-*.h5"):
         try:
             with open_file(path) as file:
-                if read_metadata(file).fidelity == "default":
+                metadata = read_metadata(file)
+                if (metadata.scene, metadata.fidelity, metadata.seed) == (scene, "default", DATASET_SEED):
                     content_hash(file, tier, splits)
                     suitable.append((path.stat().st_size, path))
         except DatasetError:

@@ -6,7 +6,7 @@ from typing import Any
 
 import h5py
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
-from m3gn_bench.datasets.file import damage_as_dataset_error, open_file, read_metadata, read_trajectory
+from m3gn_bench.datasets.file import open_file, read_metadata, read_splits, read_trajectory
 from m3gn_bench.datasets.schema import Split, in_tier, tier_sizes
 from m3gn_bench.datasets.trajectory import Trajectory
 from torch.utils.data import Dataset
@@ -35,14 +35,12 @@ class TrajectoryDataset(Dataset[Trajectory]):
         self._handle: tuple[int, h5py.File] | None = None
         with open_file(self.path) as file:
             self.metadata = read_metadata(file)
-            with damage_as_dataset_error(f"{self.path}: the splits"):
-                tasks = list(file["splits"])
-                if task not in tasks:
-                    raise DatasetError(f"{self.path}: {unknown_name('task', task, tasks)}")
-                splits = file["splits"][task]
-                if split not in splits:
-                    raise DatasetError(f"{self.path}: {unknown_name('split', split, list(splits))}")
-                keys = [key.decode() for key in splits[split][()]]
+            tasks = read_splits(file)
+        if task not in tasks:
+            raise DatasetError(f"{self.path}: {unknown_name('task', task, list(tasks))}")
+        if split not in tasks[task]:
+            raise DatasetError(f"{self.path}: {unknown_name('split', split, list(tasks[task]))}")
+        keys = tasks[task][split]
         if tier is not None:
             sizes = tier_sizes(tier, self.metadata.paper_sizes)
             keys = [key for key in keys if in_tier(key, sizes)]

@@ -12,17 +12,20 @@
     /splits/<task>/<train|validation|test>   keys of the trajectories, in order
 
 A key is <split>_<index>, e.g. test_00012. The file's content hash covers the trajectories' content hashes,
-so it does not depend on compression, on the HDF5 library or on the order of writing.
+so it does not depend on compression, on the HDF5 library or on the order of writing. It does not cover the
+root attributes and the splits: these are strings of fixed length, which HDF5 itself guards with checksums.
 """
 
 import json
 from typing import Any, Literal, get_args
 
+import numpy as np
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 FORMAT = "m3gn-bench dataset"
 SCHEMA_VERSION = 1
+DATASET_SEED = 2025  # the leaderboard's
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -64,15 +67,16 @@ class Metadata(Record):
     simulator_versions: dict[str, str]
     fidelity: str
     seed: int
-    dt: float
+    dt: float = Field(gt=0, allow_inf_nan=False)
     time_unit: str
     length_unit: str
     material_units: dict[str, str]
     load_units: dict[str, str]
-    frames: int
+    frames: int = Field(ge=2)
     scale_centre: tuple[float, ...]
-    scale_length: float
+    scale_length: float = Field(gt=0, allow_inf_nan=False)
     licence: str = "CC-BY-4.0"
+    machine: str = ""  # on which it was generated; explains the times among the diagnostics
     content_hash: str = ""
     rejections: tuple[Rejection, ...] = ()
 
@@ -87,19 +91,22 @@ class Metadata(Record):
         return self.frames - 1
 
     def to_attributes(self) -> dict[str, Any]:
-        """HDF5 attributes: scalars as they are, everything else as JSON."""
+        """HDF5 attributes: numbers as they are, strings as bytes (of fixed length), everything else as JSON."""
         dumped = self.model_dump(mode="json")
         plain = {k: v if isinstance(v, str | int | float) else json.dumps(v) for k, v in dumped.items()}
-        return {"format": FORMAT, **plain}
+        coded = {k: np.bytes_(v.encode()) if isinstance(v, str) else v for k, v in plain.items()}
+        return {"format": FORMAT, **coded}
 
     @classmethod
     def from_attributes(cls, attributes: dict[str, Any]) -> "Metadata":
-        """The inverse of `to_attributes`; raises pydantic's ValidationError on anything unexpected."""
+        """The inverse of `to_attributes`; raises ValueError (pydantic's is one) on anything unexpected."""
         values: dict[str, Any] = {}
         for name, value in attributes.items():
             if name == "format":
                 continue
-            if isinstance(value, str) and value[:1] in "{[":
+            if isinstance(value, bytes):
+                value = value.decode()
+            if isinstance(value, str) and value.startswith(("{", "[")):
                 value = json.loads(value)
             values[name] = value.item() if hasattr(value, "item") else value
         return cls.model_validate(values)
@@ -122,4 +129,4 @@ def trajectory_key(split: str, index: int) -> str:
 def in_tier(key: str, sizes: dict[Split, int]) -> bool:
     """Whether the trajectory belongs to a tier of the given sizes (tiers are prefixes of one another)."""
     split, _, index = key.rpartition("_")
-    return int(index) < {str(name): size for name, size in sizes.items()}.get(split, 0)
+    return index.isdecimal() and int(index) < {str(name): size for name, size in sizes.items()}.get(split, 0)

@@ -10,13 +10,12 @@ from typing import Literal
 import h5py
 import numpy as np
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.file import open_file, read_metadata
+from m3gn_bench.datasets.file import load_trajectory, open_file, read_metadata, read_splits
 from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, tier_sizes, trajectory_key
 from m3gn_bench.datasets.trajectory import (
     CELL_CORNERS,
     FIXED,
     VTK_TETRA,
-    Mesh,
     Trajectory,
     combine_hashes,
 )
@@ -35,6 +34,7 @@ CODES = {
     "W001": "the file does not hold its whole tier",
     "W002": "the file holds something that the schema does not know",
 }
+TRAJECTORY_GROUP = {"positions", "mesh", "material", "loads", "collider_positions", "diagnostics"}
 
 
 class Problem(Record):
@@ -73,7 +73,7 @@ def validate(
                 problems += _file_problems(file, metadata, hashes)
     except DatasetError as error:
         problems.append(Problem(code="E001", where="/", message=str(error)))
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+    except Exception as error:  # HDF5 has no list of what it raises on damaged files
         problems.append(Problem(code="E003", where="/", message=f"damaged: {error}"))
     failing = [p for p in problems if strict or p.code.startswith("E")]
     return ValidationReport(file=str(path), trajectories=count, ok=not failing, problems=tuple(problems))
@@ -93,43 +93,26 @@ def _trajectory_problems(
     where = f"/trajectories/{key}"
 
     def problem(
-        code: Literal["E003", "E004", "E005", "E006", "E007", "E008", "E009"], message: str
+        code: Literal["E003", "E004", "E005", "E006", "E007", "E008", "E009", "W002"], message: str
     ) -> Problem:
         return Problem(code=code, where=where, message=message)
 
     try:
-        group = file[where]
-        mesh = Mesh(
-            rest_positions=group["mesh/rest_positions"][()],
-            cells=group["mesh/cells"][()],
-            cell_type=int(group["mesh/cell_type"][()]),
-            node_type=group["mesh/node_type"][()],
-        )
-        trajectory = Trajectory(
-            positions=group["positions"][()],
-            mesh=mesh,
-            material={name: float(value) for name, value in group["material"].attrs.items()},
-            loads={name: array[()] for name, array in group.get("loads", {}).items()},
-            collider_positions=group["collider_positions"][()] if "collider_positions" in group else None,
-        )
-        stored = str(group.attrs["content_hash"])
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        yield problem("E003", f"cannot be read: {error}")
+        trajectory, stored = load_trajectory(file, key)
+    except DatasetError as error:
+        yield problem("E003", str(error))
         return
+    mesh = trajectory.mesh
+    nodes = len(mesh.rest_positions)
     hashes[key] = stored
+    for name in sorted(set(file[where]) - TRAJECTORY_GROUP):
+        yield problem("W002", f"{name} is unknown to the schema")
     if trajectory.content_hash() != stored:
         yield problem("E009", "the content hash does not match")
 
-    nodes = len(mesh.rest_positions)
-    expected = (metadata.frames, nodes, metadata.dimension)
-    if trajectory.positions.shape != expected or trajectory.positions.dtype != np.float32:
-        found = f"{trajectory.positions.shape} {trajectory.positions.dtype}"
-        yield problem("E004", f"positions are {found}, expected {expected} float32")
-        return
-    if mesh.node_type.shape != (nodes,) or mesh.cells.ndim != 2:
-        yield problem(
-            "E004", f"node_type {mesh.node_type.shape} or cells {mesh.cells.shape} do not fit {nodes} nodes"
-        )
+    misfits = list(_misfits(trajectory, metadata))
+    yield from (problem("E004", misfit) for misfit in misfits)
+    if misfits:
         return
     if set(trajectory.material) != set(metadata.material_units):
         yield problem(
@@ -142,10 +125,10 @@ def _trajectory_problems(
             )
     if not all(np.isfinite(value) for value in trajectory.material.values()):
         yield problem("E005", "the material is not finite")
-    if CELL_CORNERS.get(mesh.cell_type) != mesh.cells.shape[1]:
-        yield problem("E006", f"cells of {mesh.cells.shape[1]} corners have VTK type {mesh.cell_type}")
+    if not len(mesh.cells) or CELL_CORNERS.get(mesh.cell_type) != mesh.cells.shape[1]:
+        yield problem("E006", f"cells of shape {mesh.cells.shape} have VTK type {mesh.cell_type}")
         return
-    if mesh.cells.size and not 0 <= mesh.cells.min() <= mesh.cells.max() < nodes:
+    if not 0 <= mesh.cells.min() <= mesh.cells.max() < nodes:
         yield problem("E006", f"cells refer to nodes {mesh.cells.min()}..{mesh.cells.max()} of {nodes}")
         return
     smallest = cell_volumes(mesh.rest_positions, mesh.cells, mesh.cell_type).min()
@@ -154,6 +137,26 @@ def _trajectory_problems(
     moving = trajectory.positions[:, mesh.node_type == FIXED]
     if moving.size and np.ptp(moving, axis=0).max() > 0:
         yield problem("E008", f"a fixed node moves by up to {np.ptp(moving, axis=0).max():.3g}")
+
+
+def _misfits(trajectory: Trajectory, metadata: Metadata) -> Iterator[str]:
+    """Arrays of another shape or type than the schema's; None stands for any length."""
+    mesh = trajectory.mesh
+    frames, nodes, dimension = metadata.frames, mesh.rest_positions.shape[:1], metadata.dimension
+    expected = {
+        "mesh/rest_positions": (mesh.rest_positions, (*nodes, dimension), "float32"),
+        "mesh/cells": (mesh.cells, (None, None), "int32"),
+        "mesh/node_type": (mesh.node_type, nodes, "uint8"),
+        "positions": (trajectory.positions, (frames, *nodes, dimension), "float32"),
+    }
+    if trajectory.collider_positions is not None:
+        expected["collider_positions"] = (trajectory.collider_positions, (frames, None, dimension), "float32")
+    for name, (array, shape, dtype) in expected.items():
+        fits = len(array.shape) == len(shape) and all(
+            e in (None, a) for a, e in zip(array.shape, shape, strict=True)
+        )
+        if not fits or array.dtype != dtype:
+            yield f"{name} is {array.shape} {array.dtype}, expected {shape} {dtype}"
 
 
 def cell_volumes(positions: np.ndarray, cells: np.ndarray, cell_type: int) -> np.ndarray:
@@ -172,11 +175,15 @@ def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) 
         yield Problem(
             code="E009", where="/", message="the file's content hash does not match its trajectories'"
         )
-    for task, splits in file.get("splits", {}).items():
+    try:
+        tasks = read_splits(file) if "splits" in file else {}
+    except DatasetError as error:
+        yield Problem(code="E003", where="/splits", message=str(error))
+        return
+    for task, splits in tasks.items():
         seen: set[str] = set()
-        for split in splits:
+        for split, keys in splits.items():
             where = f"/splits/{task}/{split}"
-            keys = [key.decode() for key in splits[split][()]]
             if split not in SPLITS:
                 yield Problem(code="E010", where=where, message=f"unknown split; known: {', '.join(SPLITS)}")
             missing = [key for key in keys if key not in hashes]
@@ -184,12 +191,12 @@ def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) 
                 yield Problem(
                     code="E010", where=where, message=f"lists {missing[0]}, which is not in the file"
                 )
-            if len(set(keys)) < len(keys) or seen & set(keys):
-                yield Problem(
-                    code="E010", where=where, message="lists a trajectory twice, or one of another split"
-                )
+            foreign = [key for key in keys if key in seen or key.rpartition("_")[0] != split]
+            if foreign or len(set(keys)) < len(keys):
+                message = "lists a trajectory twice, or one of another split"
+                yield Problem(code="E010", where=where, message=message)
             seen |= set(keys)
-    if not file.get("splits"):
+    if not tasks:
         yield Problem(code="E010", where="/splits", message="there are no splits")
     sizes = tier_sizes(metadata.tier, metadata.paper_sizes)
     absent = [

@@ -17,6 +17,7 @@ from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.schema import Metadata, Rejection, Split
 from m3gn_bench.datasets.trajectory import Trajectory, combine_hashes, hash_arrays
 
+LIBVER = "v110"  # HDF5 1.10 and later read it; the first format with checksums on everything but the arrays
 COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
@@ -49,7 +50,7 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
 def write_shard(path: Path, key: str, trajectory: Trajectory, metadata: Metadata) -> str:
     """Write one trajectory as a dataset file of its own and return its content hash."""
     buffer = io.BytesIO()  # in memory first: a full disk then is an ordinary OSError, not an HDF5 one
-    with h5py.File(buffer, "w") as file:
+    with h5py.File(buffer, "w", libver=LIBVER) as file:
         digest = _write_trajectory(file, key, trajectory)
         file.attrs.update(metadata.model_copy(update={"content_hash": digest}).to_attributes())
     write_bytes_atomically(path, buffer.getvalue())
@@ -102,7 +103,7 @@ def merge_shards(
     if stats.f_bavail * stats.f_frsize < needed:
         raise DatasetError(f"cannot write {path}: {needed >> 20} MiB needed, less is free in {path.parent}")
 
-    with atomic_path(path) as temporary, _hdf5_errors(path), h5py.File(temporary, "w", libver="v110") as file:
+    with atomic_path(path) as temporary, _hdf5_errors(path), h5py.File(temporary, "w", libver=LIBVER) as file:
         file.create_group("meshes")
         file.create_group("trajectories")
         for key, shard in shards.items():
@@ -123,7 +124,7 @@ def merge_shards(
                     members.setdefault(f"splits/{task}/{split}", []).append(key)
                 rejections += Metadata.from_attributes(dict(source.attrs)).rejections
         for name, keys in members.items():
-            file.create_dataset(name, data=keys, dtype=h5py.string_dtype())
+            file.create_dataset(name, data=np.array(keys, "S"), chunks=(len(keys),), fletcher32=True)
         content_hash = combine_hashes(hashes)
         complete = metadata.model_copy(update={"content_hash": content_hash, "rejections": tuple(rejections)})
         file.attrs.update(complete.to_attributes())

@@ -1,6 +1,7 @@
 """Make a dataset: draw, simulate, check, shard, merge. Resumable, and the same for any number of workers."""
 
 import os
+import platform
 import shutil
 import threading
 import time
@@ -172,7 +173,16 @@ def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadat
         frames=scene.frames,
         scale_centre=scene.scale_centre,
         scale_length=scene.scale_length,
+        machine=_machine(),
     )
+
+
+def _machine() -> str:
+    """The processor, for the record."""
+    names = Path("/proc/cpuinfo")
+    lines = names.read_text().splitlines() if names.is_file() else []
+    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    return f"{model or platform.processor() or platform.machine()}, {os.cpu_count()} cores"
 
 
 @contextmanager
@@ -196,7 +206,7 @@ def _is_complete(shard: Path, key: str, metadata: Metadata) -> bool:
             read_trajectory(file, key)
     except DatasetError:
         return False
-    own = {"tier", "content_hash", "rejections"}
+    own = {"tier", "content_hash", "rejections", "machine"}
     return found.model_dump(exclude=own) == metadata.model_dump(exclude=own)
 
 

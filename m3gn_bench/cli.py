@@ -238,6 +238,22 @@ def info(file: Path, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@JSON
+def card(file: Path, as_json: bool) -> None:
+    """Write the numbers of a dataset FILE into its scene's card."""
+    from m3gn_bench.datasets.card import CARDS, fill, numbers
+    from m3gn_bench.datasets.file import open_file, read_metadata
+    from m3gn_bench.datasets.writer import write_bytes_atomically
+
+    with open_file(file) as opened:
+        scene = read_metadata(opened).scene
+    path = CARDS / f"{scene}.md"
+    write_bytes_atomically(path, fill(path.read_text(), numbers(file)).encode())
+    Report(as_json).finish({"card": str(path)}, f"{path}: written")
+
+
+@cli.command()
 @click.option("--task", required=True, help="What to train on.")
 @click.option("--model", required=True, help="Which model.")
 @click.option("--preset", default="compact", show_default=True, help="smoke, compact or paper.")

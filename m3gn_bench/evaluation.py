@@ -8,7 +8,7 @@ from m3gn_bench.data import Case, join
 from m3gn_bench.metrics import TrajectoryErrors, concatenate, trajectory_errors
 from m3gn_bench.model import Model
 
-BATCH = 16  # trajectories predicted together
+BATCH = 4  # trajectories predicted together: more leave a CPU's cache, and take longer each
 
 
 def evaluate_model(

@@ -6,6 +6,8 @@ description z. A second network reads the anchor graph and z and gives each node
 movement primitive, whose time scale tau is shared by all nodes of a trajectory.
 """
 
+import math
+
 import numpy as np
 import torch
 from pydantic import Field
@@ -28,8 +30,11 @@ class M3GNConfig(Config):
     basis_functions: int = Field(default=30, ge=2)
     alpha: float = Field(default=25.0, gt=0)
     alpha_x: float = Field(default=2.0, gt=0)
-    # Context pairs encoded per training step, drawn at random; all of them when predicting. The maximum over
-    # time does not mind missing pairs, and encoding all of them takes most of a step's time.
+    # Where tau starts before training. Small weights suffice around 0.7 of the horizon (see docs/models.md).
+    initial_tau: float = Field(default=1.65, gt=TAU_RANGE[0], lt=TAU_RANGE[1])
+    # Context pairs encoded per training step: the last one and some others at random; all of them when
+    # predicting. The maximum over time does not mind missing pairs, and encoding all would take most of a
+    # step's time.
     training_context_pairs: int | None = Field(default=None, ge=1)
 
 
@@ -53,6 +58,10 @@ class M3GN(Model):
             dimension * (config.basis_functions + 1) + 1,
             **size,
         )
+        lower, upper = TAU_RANGE
+        place = (config.initial_tau - lower) / (upper - lower)
+        with torch.no_grad():
+            self.simulator.readout.bias[0] = math.log(place / (1 - place))
         self.primitives = ProDMP(config.basis_functions, config.alpha, config.alpha_x)
 
     def predict(self, context: Context) -> Tensor:
@@ -64,9 +73,11 @@ class M3GN(Model):
         """Mean squared error of free nodes after a random anchor, relative to the data's variance."""
         lower, upper = self.task.training_context
         context = case.context(int(rng.integers(lower, upper + 1)))
-        pairs = np.arange(len(context.positions) - 1)
+        last = len(context.positions) - 2
+        others = rng.permutation(last)
         if self.config.training_context_pairs is not None:
-            pairs = np.sort(rng.permutation(pairs)[: self.config.training_context_pairs])
+            others = others[: self.config.training_context_pairs - 1]
+        pairs = np.append(others, last)
         latent = self.encode(context, torch.from_numpy(pairs).to(case.positions.device))
         error = self._generate(context, latent) - case.future(len(context.positions))
         return (error[:, ~case.body.fixed] / self.displacement_scale).square().mean()

@@ -158,12 +158,12 @@ class ClampedPlate:
             quadrature=_tensor_rule(LOAD_GAUSS_POINTS),
             elements=np.flatnonzero(near),
         )
-        x, y = basis.global_coordinates().value
+        x, y = basis.global_coordinates()
         squared = ((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / radius**2
         density = np.clip(1 - squared, 0, None) ** 2 * basis.dx
         shares = np.zeros(self.basis.N)
         for function, dofs in zip(basis.basis, basis.element_dofs, strict=True):
-            np.add.at(shares, dofs, (function[0].value * density).sum(-1))
+            np.add.at(shares, dofs, (function[0] * density).sum(-1))
         return np.outer(shares / density.sum(), force).ravel()
 
     def point_load(self, point: tuple[float, float], force: tuple[float, float, float]) -> Array:
@@ -175,7 +175,7 @@ class ClampedPlate:
         """Dead pressure [MPa] along z, shape [dofs]."""
         load = np.zeros(self.basis.N)
         for function, dofs in zip(self.basis.basis, self.basis.element_dofs, strict=True):
-            np.add.at(load, dofs, (function[0].value * self._weights).sum(-1))
+            np.add.at(load, dofs, (function[0] * self._weights).sum(-1))
         return np.outer(load, [0, 0, pressure]).ravel()
 
     # -- states --------------------------------------------------------------------------------------

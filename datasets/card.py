@@ -1,0 +1,78 @@
+"""Fill the numbers of a dataset's card from the dataset file, so that none is typed by hand.
+
+A card is Markdown written by people, with one block between two markers that belongs to this module.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.file import content_hash, damage_as_dataset_error, open_file, read_metadata, read_trajectory
+from m3gn_bench.datasets.schema import TIERS
+
+CARDS = Path(__file__).parent / "cards"
+BEGIN = "<!-- numbers: written by `m3gn-bench card`, do not edit -->"
+END = "<!-- end of numbers -->"
+
+
+def numbers(path: Path) -> str:
+    """The generated block for a dataset file, without its markers."""
+    with open_file(path) as file:
+        metadata = read_metadata(file)
+        with damage_as_dataset_error(str(path)):
+            keys = list(file["trajectories"])
+            splits = {
+                task: "/".join(str(len(group[split])) for split in ("train", "validation", "test"))
+                for task, group in file["splits"].items()
+            }
+        tiers = []
+        for tier in TIERS:
+            try:
+                tiers.append((tier, content_hash(file, tier)))
+            except DatasetError:
+                continue
+        diagnostics: dict[str, list[float]] = {}
+        steps = []
+        for key in keys:
+            trajectory = read_trajectory(file, key)
+            for name, value in trajectory.diagnostics.items():
+                diagnostics.setdefault(name, []).append(value)
+            steps.append(np.diff(trajectory.positions / metadata.scale_length, axis=0))
+    moved = np.stack(steps)
+    mesh = trajectory.mesh
+    rows = [
+        ("trajectories", f"{len(keys)}, tier `{metadata.tier}`, dataset version {metadata.dataset_version}"),
+        *((f"train/validation/test of `{task}`", sizes) for task, sizes in splits.items()),
+        ("frames, transitions", f"{metadata.frames}, {metadata.transitions}"),
+        ("nodes, cells", f"{len(mesh.rest_positions)}, {len(mesh.cells)}"),
+        ("time step", f"{metadata.dt:g} ({metadata.time_unit})"),
+        ("lengths", f"{metadata.length_unit}; models see (x - {metadata.scale_centre}) / {metadata.scale_length:g}"),
+        ("movement per step, scaled", f"mean {_vector(moved.mean((0, 1, 2)))}, std {_vector(moved.std((0, 1, 2)))}"),
+        ("rejected draws", "; ".join(f"{r.key}: {r.reason}" for r in metadata.rejections) or "0"),
+        ("CPU time per trajectory", _range(diagnostics.pop("cpu_seconds"), " s")),
+        *((name.replace("_", " "), _range(values, "")) for name, values in diagnostics.items()),
+        ("file size", f"{path.stat().st_size / 1e6:.1f} MB"),
+        ("machine", metadata.machine),
+        ("versions", ", ".join(f"{k} {v}" for k, v in metadata.simulator_versions.items())),
+        ("generator, seed", f"m3gn-bench {metadata.generator_version}, {metadata.seed}"),
+        *((f"content hash, {tier}", f"`{digest}`") for tier, digest in tiers),
+    ]
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def fill(card: str, block: str) -> str:
+    """The card with its block replaced. Raises DatasetError if the card has no such block."""
+    before, begin, rest = card.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise DatasetError(f"the card has no block between {BEGIN!r} and {END!r}")
+    return f"{before}{BEGIN}\n{block}\n{END}{after}"
+
+
+def _range(values: list[float], unit: str) -> str:
+    return f"mean {np.mean(values):.3g}, min {min(values):.3g}, max {max(values):.3g}{unit}"
+
+
+def _vector(values: np.ndarray) -> str:
+    return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"

@@ -1,0 +1,132 @@
+"""The training loop: it learns, it resumes to the same state, it refuses nonsense."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from test_models import LEARNED, TASK, make_case
+
+import m3gn_bench.training
+from m3gn_bench.checkpoint import Checkpoint, load_checkpoint
+from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
+from m3gn_bench.evaluation import evaluate_model
+from m3gn_bench.model import load_preset
+from m3gn_bench.training import STATE, Progress, train
+
+CASES = [make_case(seed) for seed in range(4)]
+HELD_OUT = [make_case(seed) for seed in range(10, 12)]
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing in the loop may catch it."""
+
+
+def run(name: str, out: Path, steps: int, kill_at: int | None = None, seed: int = 0, **settings: object) -> Checkpoint:
+    overrides = {"training.steps": steps, "training.validations": 3, **settings}
+
+    def observe(progress: Progress) -> None:
+        if progress.step == kill_at:
+            raise Killed
+
+    return train(
+        load_preset(name, "smoke", TASK, overrides),
+        TASK,
+        CASES,
+        HELD_OUT,
+        out,
+        seed=seed,
+        dataset_hash="none",
+        observe=observe,
+    )
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_resumes_to_the_same_weights(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed twice, in different phases, and still bit for bit the run that was never killed."""
+    monkeypatch.setattr(m3gn_bench.training, "SAVE_INTERVAL", 0.0)
+    whole = run(name, tmp_path / "whole", 12)
+    for kill_at in (3, 8):
+        with pytest.raises(Killed):
+            run(name, tmp_path / "killed", 12, kill_at)
+        assert (tmp_path / "killed" / STATE).is_file()
+    resumed = run(name, tmp_path / "killed", 12)
+    ignore = {"minutes"}
+    assert resumed.model_dump(exclude=ignore) == whole.model_dump(exclude=ignore)
+    first, second = (load_file(tmp_path / folder / "weights.safetensors") for folder in ("whole", "killed"))
+    assert all(torch.equal(first[key], second[key]) for key in first)
+    assert not (tmp_path / "killed" / STATE).exists()
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_learns(name: str, tmp_path: Path) -> None:
+    """Weights after some training beat those of the first step by far, on the data trained on."""
+    errors = []
+    for steps in (1, 300):
+        settings = {"training.steps": steps, "model.noise": 1e-3} if "mgn" in name else {"training.steps": steps}
+        config = load_preset(name, "smoke", TASK, settings)
+        done = train(config, TASK, CASES, CASES, tmp_path / str(steps), seed=0, dataset_hash="none")
+        errors.append(done.validation_error)
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_best_weights_are_kept(tmp_path: Path) -> None:
+    """The recorded validation error is that of the weights in the checkpoint."""
+    done = run("m3gn", tmp_path, 20)
+    model, _ = load_checkpoint(tmp_path)
+    errors = evaluate_model(model, HELD_OUT, TASK.context_sizes)
+    assert done.validation_error == pytest.approx(
+        sum(float(e.mse.mean()) for e in errors.values()) / len(errors), rel=1e-6
+    )
+
+
+def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
+    hashes = [run("mgn", tmp_path / str(i), 3, seed=seed).weights_sha256 for i, seed in enumerate((0, 0, 1))]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_time_budget_ends(tmp_path: Path) -> None:
+    config = load_preset("mgn", "smoke", TASK, {"training.minutes": 0.01})
+    done = train(config, TASK, CASES, HELD_OUT, tmp_path, seed=0, dataset_hash="none")
+    assert 0.01 <= done.minutes < 0.05
+    assert done.steps > 1
+
+
+def test_budget_is_required_and_single(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="budget"):
+        train(load_preset("mgn", "smoke", TASK), TASK, CASES, HELD_OUT, tmp_path, seed=0, dataset_hash="")
+    with pytest.raises(ConfigError, match="budget"):
+        run("mgn", tmp_path, 3, **{"training.minutes": 1.0})
+
+
+def test_other_runs_are_not_overwritten(tmp_path: Path) -> None:
+    run("mgn", tmp_path, 2)
+    assert run("mgn", tmp_path, 2).steps == 2  # the same run again is already done
+    with pytest.raises(CheckpointError, match="another finished run"):
+        run("mgn", tmp_path, 3)
+
+
+def test_state_of_another_run_or_damaged_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(m3gn_bench.training, "SAVE_INTERVAL", 0.0)
+    with pytest.raises(Killed):
+        run("mgn", tmp_path, 6, kill_at=3)
+    with pytest.raises(CheckpointError, match="other settings"):
+        run("mgn", tmp_path, 7)
+    (tmp_path / STATE).write_bytes(b"not a state")
+    with pytest.raises(CheckpointError, match="damaged"):
+        run("mgn", tmp_path, 6)
+
+
+def test_divergence_is_loud(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="learning_rate"):
+        run("mgn", tmp_path, 50, **{"training.learning_rate": 1e30, "training.warmup_steps": 0})
+
+
+def test_checkpoint_is_plain_json(tmp_path: Path) -> None:
+    run("stand_still", tmp_path, 1)
+    record = json.loads((tmp_path / "checkpoint.json").read_text())
+    assert record["steps"] == 0
+    assert record["validation_error"] is None
+    assert not math.isnan(record["minutes"])
