@@ -15,11 +15,11 @@ from torch import Tensor
 from m3gn_bench.data import Body, Case, Context
 from m3gn_bench.graph import build_graph, static_node_features
 from m3gn_bench.message_passing import MessagePassingNetwork
-from m3gn_bench.model import Config, Model
+from m3gn_bench.model import Model, ModelConfig
 from m3gn_bench.tasks import Task
 
 
-class MeshGraphNetConfig(Config):
+class MeshGraphNetConfig(ModelConfig):
     """Hyper-parameters of MeshGraphNets (defaults: the paper's)."""
 
     width: int = Field(default=128, ge=1)

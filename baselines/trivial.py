@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from m3gn_bench.data import Case, Context
-from m3gn_bench.model import Config, Model, hold_fixed
+from m3gn_bench.model import Model, ModelConfig, hold_fixed
 from m3gn_bench.tasks import Task
 
 
@@ -35,7 +35,7 @@ class MeanTrajectory(Model):
 
     mean: Tensor
 
-    def __init__(self, task: Task, config: Config) -> None:
+    def __init__(self, task: Task, config: ModelConfig) -> None:
         super().__init__(task, config)
         self.register_buffer("mean", torch.zeros(task.frames, 0, task.dimension))
 
@@ -53,4 +53,4 @@ class MeanTrajectory(Model):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
         # The mean takes the size of the mesh that it was taken from.
         self.mean = torch.zeros_like(state_dict[f"{prefix}mean"])
-        super()._load_from_state_dict(state_dict, prefix, *args)  # type: ignore[arg-type]
+        super()._load_from_state_dict(state_dict, prefix, *args)

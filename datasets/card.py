@@ -6,9 +6,14 @@ A card is Markdown written by people, with one block between two markers that be
 from pathlib import Path
 
 import numpy as np
-
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.file import content_hash, damage_as_dataset_error, open_file, read_metadata, read_trajectory
+from m3gn_bench.datasets.file import (
+    content_hash,
+    damage_as_dataset_error,
+    open_file,
+    read_metadata,
+    read_trajectory,
+)
 from m3gn_bench.datasets.schema import TIERS
 
 CARDS = Path(__file__).parent / "cards"

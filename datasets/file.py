@@ -13,6 +13,7 @@ from m3gn_bench.datasets.schema import (
     SCHEMA_VERSION,
     SPLITS,
     Metadata,
+    as_text,
     in_tier,
     tier_sizes,
 )
@@ -37,7 +38,7 @@ def open_file(path: Path) -> h5py.File:
         ) from error
     try:
         with damage_as_dataset_error(f"{path}: root attributes"):
-            found, version = file.attrs.get("format"), file.attrs.get("schema_version")
+            found, version = as_text(file.attrs.get("format")), file.attrs.get("schema_version")
         if found != FORMAT:
             raise DatasetError(f"{path} is HDF5 but no m3gn-bench dataset (attribute 'format' is {found!r})")
         if version != SCHEMA_VERSION:
@@ -97,7 +98,7 @@ def load_trajectory(file: h5py.File, key: str) -> tuple[Trajectory, str]:
             collider_positions=_array(group, "collider_positions") if "collider_positions" in group else None,
             diagnostics={name: float(value) for name, value in group["diagnostics"].attrs.items()},
         )
-        return trajectory, str(group.attrs["content_hash"])
+        return trajectory, str(as_text(group.attrs["content_hash"]))
 
 
 def _array(group: h5py.Group, name: str) -> np.ndarray:
@@ -124,7 +125,7 @@ def damage_as_dataset_error(where: str) -> Iterator[None]:
 def stored_hashes(file: h5py.File) -> dict[str, str]:
     """The recorded content hash of every trajectory, by key."""
     with damage_as_dataset_error(f"{file.filename}: the list of trajectories"):
-        return {key: str(group.attrs["content_hash"]) for key, group in file["trajectories"].items()}
+        return {key: str(as_text(group.attrs["content_hash"])) for key, group in file["trajectories"].items()}
 
 
 def read_splits(file: h5py.File) -> dict[str, dict[str, list[str]]]:

@@ -12,8 +12,8 @@
     /splits/<task>/<train|validation|test>   keys of the trajectories, in order
 
 A key is <split>_<index>, e.g. test_00012. The file's content hash covers the trajectories' content hashes,
-so it does not depend on compression, on the HDF5 library or on the order of writing. It does not cover the
-root attributes and the splits: these are strings of fixed length, which HDF5 itself guards with checksums.
+so it does not depend on compression, on the HDF5 library or on the order of writing. It does not cover root
+attributes and splits. All strings are of fixed length: HDF5 guards those with checksums, and others not.
 """
 
 import json
@@ -94,8 +94,7 @@ class Metadata(Record):
         """HDF5 attributes: numbers as they are, strings as bytes (of fixed length), everything else as JSON."""
         dumped = self.model_dump(mode="json")
         plain = {k: v if isinstance(v, str | int | float) else json.dumps(v) for k, v in dumped.items()}
-        coded = {k: np.bytes_(v.encode()) if isinstance(v, str) else v for k, v in plain.items()}
-        return {"format": FORMAT, **coded}
+        return {k: fixed_length(v) for k, v in {"format": FORMAT, **plain}.items()}
 
     @classmethod
     def from_attributes(cls, attributes: dict[str, Any]) -> "Metadata":
@@ -104,12 +103,21 @@ class Metadata(Record):
         for name, value in attributes.items():
             if name == "format":
                 continue
-            if isinstance(value, bytes):
-                value = value.decode()
+            value = as_text(value)
             if isinstance(value, str) and value.startswith(("{", "[")):
                 value = json.loads(value)
             values[name] = value.item() if hasattr(value, "item") else value
         return cls.model_validate(values)
+
+
+def fixed_length(value: Any) -> Any:
+    """A string as h5py stores it with fixed length; anything else as it is."""
+    return np.bytes_(value.encode()) if isinstance(value, str) else value
+
+
+def as_text(value: Any) -> Any:
+    """The inverse of `fixed_length`."""
+    return value.decode() if isinstance(value, bytes) else value
 
 
 def tier_sizes(tier: str, paper_sizes: dict[Split, int]) -> dict[Split, int]:

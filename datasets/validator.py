@@ -181,7 +181,6 @@ def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) 
         yield Problem(code="E003", where="/splits", message=str(error))
         return
     for task, splits in tasks.items():
-        seen: set[str] = set()
         for split, keys in splits.items():
             where = f"/splits/{task}/{split}"
             if split not in SPLITS:
@@ -191,11 +190,9 @@ def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) 
                 yield Problem(
                     code="E010", where=where, message=f"lists {missing[0]}, which is not in the file"
                 )
-            foreign = [key for key in keys if key in seen or key.rpartition("_")[0] != split]
-            if foreign or len(set(keys)) < len(keys):
+            if len(set(keys)) < len(keys) or {key.rpartition("_")[0] for key in keys} - {split}:
                 message = "lists a trajectory twice, or one of another split"
                 yield Problem(code="E010", where=where, message=message)
-            seen |= set(keys)
     if not tasks:
         yield Problem(code="E010", where="/splits", message="there are no splits")
     sizes = tier_sizes(metadata.tier, metadata.paper_sizes)

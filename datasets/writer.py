@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.schema import Metadata, Rejection, Split
+from m3gn_bench.datasets.schema import Metadata, Rejection, Split, as_text, fixed_length
 from m3gn_bench.datasets.trajectory import Trajectory, combine_hashes, hash_arrays
 
 LIBVER = "v110"  # HDF5 1.10 and later read it; the first format with checksums on everything but the arrays
@@ -70,7 +70,7 @@ def _write_trajectory(file: h5py.File, key: str, trajectory: Trajectory) -> str:
     group.create_group("material").attrs.update(trajectory.material)
     group.create_group("diagnostics").attrs.update(trajectory.diagnostics)
     digest = trajectory.content_hash()
-    group.attrs["content_hash"] = digest
+    group.attrs["content_hash"] = fixed_length(digest)
     return digest
 
 
@@ -113,12 +113,12 @@ def merge_shards(
                     source.copy(f"meshes/{mesh_name}", file["meshes"])
                 origin = source[f"trajectories/{key}"]
                 group = file.create_group(f"trajectories/{key}")
-                group.attrs.update(origin.attrs)
+                group.attrs["content_hash"] = origin.attrs["content_hash"]
                 for name in origin:
                     if name != "mesh":
                         source.copy(origin[name], group, name)
                 group["mesh"] = file[f"meshes/{mesh_name}"]
-                hashes[key] = str(origin.attrs["content_hash"])
+                hashes[key] = as_text(origin.attrs["content_hash"])
                 split, _, _ = key.rpartition("_")
                 for task in tasks_of(split, dict(origin["material"].attrs)):  # type: ignore[arg-type]
                     members.setdefault(f"splits/{task}/{split}", []).append(key)

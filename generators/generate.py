@@ -1,23 +1,34 @@
 """Make a dataset: draw, simulate, check, shard, merge. Resumable, and the same for any number of workers."""
 
+import fcntl
 import os
 import platform
 import shutil
+import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
-from m3gn_bench.datasets.schema import SPLITS, Metadata, Rejection, Split, tier_sizes, trajectory_key
+from m3gn_bench.datasets.schema import (
+    DATASET_SEED,
+    SPLITS,
+    Metadata,
+    Rejection,
+    Split,
+    tier_sizes,
+    trajectory_key,
+)
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
@@ -26,7 +37,6 @@ from threadpoolctl import threadpool_limits
 
 from m3gn_bench.version import __version__
 
-DATASET_SEED = 2025
 MAX_ATTEMPTS = 10
 
 
@@ -84,13 +94,15 @@ def simulate_one(
     )
 
 
-def dataset_name(scene: str, tier: str, splits: Sequence[str], fidelity: str) -> str:
+def dataset_name(scene: str, tier: str, splits: Sequence[str], fidelity: str, seed: int) -> str:
     """File name of a dataset: whatever is not the default is part of it."""
     parts = [scene, tier]
     if set(splits) != set(SPLITS):
         parts += [split for split in SPLITS if split in splits]
     if fidelity != "default":
         parts.append(fidelity)
+    if seed != DATASET_SEED:
+        parts.append(f"seed{seed}")
     return "-".join(parts) + ".h5"
 
 
@@ -127,7 +139,7 @@ def generate(
     if workers < 1:
         raise GeneratorError(f"workers must be at least 1, not {workers}")
     metadata = _metadata(scene, tier, fidelity, seed)
-    path = out / dataset_name(scene_name, tier, splits, fidelity)
+    path = out / dataset_name(scene_name, tier, splits, fidelity, seed)
     shard_folder = out / f".{scene_name}-{fidelity}-seed{seed}.shards"
     sizes = tier_sizes(tier, scene.paper_sizes)
     wanted: dict[str, tuple[Split, int]] = {
@@ -137,20 +149,26 @@ def generate(
         for i in range(sizes[split])
     }
     shards = {key: shard_folder / f"{key}.h5" for key in wanted}
-    with _writable(shard_folder):
+    with _reserved(shard_folder):
+        for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
+            left_by_killed_run.unlink()
         todo = [key for key in wanted if not _is_complete(shards[key], key, metadata)]
-    done = len(wanted) - len(todo)
-    on_progress(done, len(wanted))
-    jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
-    for _ in _run(jobs, workers):
-        done += 1
+        done = len(wanted) - len(todo)
         on_progress(done, len(wanted))
+        jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
+        with closing(_run(jobs, workers)) as finished:  # so that an exception here ends the workers, too
+            for _ in finished:
+                done += 1
+                on_progress(done, len(wanted))
 
-    content_hash = merge_shards(path, shards, metadata, scene.tasks_of)
-    with open_file(path) as file:
-        rejections = list(read_metadata(file).rejections)
-        seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
-    shutil.rmtree(shard_folder)
+        content_hash = merge_shards(path, shards, metadata, scene.tasks_of)
+        with open_file(path) as file:
+            rejections = list(read_metadata(file).rejections)
+            seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
+        for shard in shards.values():
+            shard.unlink()
+        if not any(shard_folder.glob("*.h5")):  # else a run of a larger tier was interrupted, and may go on
+            shutil.rmtree(shard_folder)
     return GenerationReport(path, content_hash, len(wanted), rejections, float(np.mean(seconds)), len(todo))
 
 
@@ -186,14 +204,21 @@ def _machine() -> str:
 
 
 @contextmanager
-def _writable(folder: Path) -> Iterator[None]:
+def _reserved(folder: Path) -> Iterator[None]:
+    """The folder of shards, made if need be, for this process alone (the lock ends with the process)."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(13, "Permission denied")
-        yield
+        lock = (folder / "lock").open("w")
     except OSError as error:
         raise DatasetError(f"cannot write to {folder.parent}: {error.strerror or error}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise GeneratorError(
+                f"another process generates this dataset in {folder.parent}; wait until it has finished"
+            ) from None
+        yield
 
 
 def _is_complete(shard: Path, key: str, metadata: Metadata) -> bool:
@@ -225,41 +250,55 @@ def _make_shard(job: _Job) -> None:
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
 
 
-def _run(jobs: Iterator[_Job], workers: int) -> Iterator[None]:
+def _run(jobs: Iterator[_Job], workers: int) -> Generator[None]:
     """Run the jobs, yielding once per finished one; a failure or an interrupt stops the rest at once."""
     if workers == 1:
         for job in jobs:
-            yield _make_shard(job)
+            _make_shard(job)
+            yield
         return
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_exit_with_parent)
+    context = get_context("spawn")
+    end, parent_lives = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(end,))
     try:
         pending: set[Future[None]] = set()
         for job in jobs:
-            pending.add(pool.submit(_make_shard, job))
+            with _interrupts_held():
+                pending.add(pool.submit(_make_shard, job))
             if len(pending) >= 2 * workers:
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    yield future.result()
+                    future.result()
+                    yield
         for future in pending:
-            yield future.result()
+            future.result()
+            yield
+        pool.shutdown()
     except BrokenProcessPool as error:
         raise GeneratorError(
             "a worker process died (out of memory, or killed); run the same command again to go on"
         ) from error
     finally:
+        parent_lives.close()
         pool.shutdown(cancel_futures=True)
+        end.close()
 
 
-def _exit_with_parent() -> None:
-    """A worker whose parent was killed would wait for work forever: end with it instead."""
-    import signal
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C is for this process alone, a moment later: processes started in here inherit deafness to it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    parent = parent_process()
-    assert parent is not None
+
+def _end_with(end: Connection) -> None:
+    """End this worker, whatever it does, once the parent closes its side of the pipe or is killed."""
 
     def watch() -> None:
-        parent.join()
+        end.poll(None)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

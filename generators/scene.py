@@ -45,6 +45,10 @@ class Scene(Protocol):
         """The tasks in whose `split` a trajectory with this material takes part."""
         ...
 
+    def task_size(self, task: str, split: Split, trajectories: int) -> int:
+        """How many of the first `trajectories` of a split take part in a task."""
+        ...
+
     def simulator_versions(self) -> dict[str, str]:
         """Versions of the libraries whose code shapes the numbers."""
         ...

@@ -65,7 +65,7 @@ def list_command(as_json: bool) -> None:
     from m3gn_bench.model import PRESETS, build_model, load_preset, model_names
     from m3gn_bench.tasks import TASKS
 
-    tasks = [
+    tasks: list[dict[str, Any]] = [
         {
             "name": task.name,
             "title": task.title,
@@ -74,9 +74,16 @@ def list_command(as_json: bool) -> None:
             "transitions": task.frames - 1,
             "dimension": task.dimension,
             "context_sizes": task.context_sizes,
-            "tiers": {tier: tier_sizes(tier, get_scene(task.scene).paper_sizes) for tier in TIERS},
+            "tiers": {
+                tier: {
+                    split: scene.task_size(task.name, split, size)
+                    for split, size in tier_sizes(tier, scene.paper_sizes).items()
+                }
+                for tier in TIERS
+            },
         }
         for task in TASKS.values()
+        for scene in [get_scene(task.scene)]
     ]
     models = [
         {

@@ -1,7 +1,7 @@
 """From stored trajectories to what models see: scaled tensors, and no more of the future than is allowed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -109,15 +109,16 @@ class Case:
 
     def to(self, device: torch.device) -> "Case":
         """The same case on another device."""
-        moved = {
-            f.name: value.to(device)
-            for f in fields(Body)
-            if isinstance(value := getattr(self.body, f.name), Tensor)
-        }
-        path = None if self.collider_path is None else self.collider_path.to(device)
-        return replace(
-            self, body=replace(self.body, **moved), positions=self.positions.to(device), collider_path=path
+        body = Body(
+            rest_positions=self.body.rest_positions.to(device),
+            edges=self.body.edges.to(device),
+            static_features=self.body.static_features.to(device),
+            fixed=self.body.fixed.to(device),
+            material=self.body.material.to(device),
+            node_counts=self.body.node_counts,
         )
+        path = None if self.collider_path is None else self.collider_path.to(device)
+        return Case(body, self.positions.to(device), path, self.keys)
 
 
 def join(cases: Sequence[Case]) -> Case:

@@ -21,13 +21,13 @@ from m3gn_bench.tasks import Task
 ENTRY_POINTS = "m3gn_bench.models"
 
 
-class Config(BaseModel):
+class ModelConfig(BaseModel):
     """Base of all configurations: an unknown key is an error, and nothing changes after the start."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class TrainingConfig(Config):
+class TrainingConfig(ModelConfig):
     """How to train; the same loop serves every model.
 
     The budget is either `minutes` or `steps`. On a CPU minutes are CPU time of the training steps (validation
@@ -57,14 +57,14 @@ class Model(nn.Module):
             movement in one step, and since the first frame; they make inputs and outputs of order one.
     """
 
-    Config: ClassVar[type[Config]] = Config
+    Config: ClassVar[type[ModelConfig]] = ModelConfig
     uses_material: ClassVar[bool] = False
     preset_file: ClassVar[str | None] = None  # in the folder `presets` of the module's package
 
     velocity_scale: Tensor
     displacement_scale: Tensor
 
-    def __init__(self, task: Task, config: Config) -> None:
+    def __init__(self, task: Task, config: ModelConfig) -> None:
         super().__init__()
         self.task = task
         self.config = config
@@ -120,7 +120,7 @@ class RunConfig(BaseModel):
 
     model_name: str
     preset: str
-    model: Config
+    model: ModelConfig
     training: TrainingConfig
 
     def to_json(self) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def train(
     model = build_model(config, task, seed)
     model.prepare(training_cases)
     model.to(where)
-    describe = {
+    describe: dict[str, Any] = {
         "task": task.name,
         "seed": seed,
         "config": config.to_json(),

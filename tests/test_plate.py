@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate
@@ -11,7 +10,7 @@ from m3gn_bench.generators.solvers.quasistatic import load_path
 
 def make_plate(nodes: int = 5, thickness: float = 0.05) -> ClampedPlate:
     return ClampedPlate(
-        side=1.0, nodes_per_side=nodes, thickness=thickness, youngs_modulus=10.0, poisson_ratio=0.3
+        ticks=np.linspace(0, 1, nodes), thickness=thickness, youngs_modulus=10.0, poisson_ratio=0.3
     )
 
 
@@ -118,11 +117,11 @@ def test_bisection_rescues_a_large_increment() -> None:
     [
         ({"youngs_modulus": 0.0}, "youngs_modulus"),
         ({"poisson_ratio": 0.5}, "poisson_ratio"),
-        ({"nodes_per_side": 2}, "nodes_per_side"),
+        ({"ticks": np.array([0.0, 0.5, 0.5, 1.0])}, "ticks"),
     ],
 )
-def test_bad_parameters_are_refused(change: dict[str, float], message: str) -> None:
-    good = {"side": 1.0, "nodes_per_side": 5, "thickness": 0.1, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
+def test_bad_parameters_are_refused(change: dict[str, object], message: str) -> None:
+    good = {"ticks": np.linspace(0, 1, 5), "thickness": 0.1, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
     with pytest.raises(ValueError, match=message):
         ClampedPlate(**{**good, **change})  # type: ignore[arg-type]
 

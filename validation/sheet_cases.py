@@ -18,7 +18,7 @@ from m3gn_bench.generators.solvers.quasistatic import load_path
 from m3gn_bench.generators.solvers.sparse import Array
 from scipy.spatial import cKDTree
 
-CENTRES = ((50.0, 60.0), (95.0, 85.0))  # [mm], neither on a node nor on a symmetry axis of the pair
+CENTRES = ((50.0, 60.0), (95.0, 85.0))  # [mm], one on a node and one amid a cell, with no symmetry
 SAME = (-FORCE, -FORCE)
 OPPOSITE = (FORCE, -FORCE)
 

@@ -15,6 +15,9 @@ from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler, BandedC
 from scipy.linalg import LinAlgError
 
 
+SHORTEST_STEP = 2**-12  # of a Newton step; a line search that goes below has failed
+
+
 class StoredEnergy(Protocol):
     """What Newton needs to know of an elastic body; all vectors are over the free unknowns."""
 
@@ -84,23 +87,23 @@ class ModifiedNewton:
 
             length = 1.0
             # The potential is a small difference of large numbers near the minimum: allow its round-off.
-            slack = 1e-12 * max(abs(energy), abs(potential))
+            slack = 1e-12 * max(abs(energy), float(abs(potential)))
             while True:
                 trial = x + length * direction
-                energy, force = self._evaluate(trial)
-                trial_potential = energy - load @ trial
+                trial_energy, force = self._evaluate(trial)
+                trial_potential = trial_energy - load @ trial
                 if trial_potential <= potential + 1e-4 * length * slope + slack:
                     break
                 self.statistics.rejected_steps += 1
                 length *= 0.5
-                if length < 2**-12:
+                if length < SHORTEST_STEP:
                     if fresh:
                         raise SolverError(f"line search failed, residual {norm / load_scale:.2e} of the load")
                     break
-            if length < 2**-12:  # the old factor no longer points downhill far enough: make a new one
+            if length < SHORTEST_STEP:  # the old factor no longer points downhill far enough: make a new one
                 self.forget()
                 continue
-            x, potential, residual = trial, trial_potential, force - load
+            x, energy, potential, residual = trial, trial_energy, trial_potential, force - load
             previous, norm = norm, float(np.linalg.norm(residual))
             if norm > self.refactor_ratio * previous:
                 self.forget()

@@ -37,8 +37,8 @@ class ClampedPlate:
     The unknowns are, per node, the displacement, its two slopes and its twist, each with three components.
 
     Args:
-        side: edge length [mm].
-        nodes_per_side: nodes along an edge; the elements are the cells between them.
+        ticks: coordinates of the nodes along either edge [mm], increasing from 0 to the side's length; they
+            may crowd near the border, where a soft plate bends in a layer narrower than an even mesh.
         thickness: h [mm].
         youngs_modulus: E [MPa].
         poisson_ratio: nu.
@@ -47,28 +47,17 @@ class ClampedPlate:
         ValueError: a parameter outside its physical range.
     """
 
-    def __init__(
-        self,
-        *,
-        side: float,
-        nodes_per_side: int,
-        thickness: float,
-        youngs_modulus: float,
-        poisson_ratio: float,
-    ) -> None:
-        if min(side, thickness, youngs_modulus) <= 0:
-            raise ValueError(
-                f"side, thickness and youngs_modulus must be positive, not {side}, {thickness}, {youngs_modulus}"
-            )
+    def __init__(self, *, ticks: Array, thickness: float, youngs_modulus: float, poisson_ratio: float) -> None:
+        if min(thickness, youngs_modulus) <= 0:
+            raise ValueError(f"thickness and youngs_modulus must be positive, not {thickness}, {youngs_modulus}")
         if not -1 < poisson_ratio < 0.5:
             raise ValueError(f"poisson_ratio must lie in (-1, 0.5), not {poisson_ratio}")
-        if nodes_per_side < 3:
-            raise ValueError(f"nodes_per_side must be at least 3, not {nodes_per_side}")
-        self.side = side
+        if len(ticks) < 3 or ticks[0] != 0 or np.diff(ticks).min() <= 0:
+            raise ValueError(f"ticks must be three or more numbers that increase from 0, not {ticks}")
+        self.side = float(ticks[-1])
         self.thickness = thickness
         self.youngs_modulus = youngs_modulus
         self.poisson_ratio = poisson_ratio
-        ticks = np.linspace(0, side, nodes_per_side)
         self.mesh = MeshQuad.init_tensor(ticks, ticks)
         self.basis = Basis(self.mesh, ElementQuadBFS(), quadrature=_tensor_rule(GAUSS_POINTS))
 

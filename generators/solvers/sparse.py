@@ -53,12 +53,13 @@ class BandedAssembler:
 
     def vector(self, element_vectors: Array) -> Array:
         """Sum element vectors [elements, local_dofs] into the free unknowns [unknowns]."""
-        return np.bincount(self._element_dofs, element_vectors.ravel(), self.dofs)[self.free]
+        gathered: Array = np.bincount(self._element_dofs, element_vectors.ravel(), self.dofs)
+        return gathered[self.free]
 
     def matrix(self, element_matrices: Array) -> Array:
         """Sum element matrices [elements, local_dofs, local_dofs] into [bandwidth + 1, unknowns]."""
         size = (self.bandwidth + 1) * self.unknowns
-        flat = np.bincount(self._slots, element_matrices.reshape(-1)[self._entries], size)
+        flat: Array = np.bincount(self._slots, element_matrices.reshape(-1)[self._entries], size)
         return flat.reshape(self.bandwidth + 1, self.unknowns)
 
     def factorise(self, matrix: Array) -> "BandedCholesky":

@@ -1,0 +1,388 @@
+"""Whatever is wrong with what a user asks for or hands in: one clear line and an exit code, no traceback."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+import pytest
+from conftest import TetraWriter
+from m3gn_bench.datasets.file import open_file, read_metadata
+from m3gn_bench.datasets.schema import Metadata
+from m3gn_bench.datasets.trajectory import Trajectory
+
+from m3gn_bench.cli import run
+
+TASK = "sheet_deformation"
+
+
+class Outcome(NamedTuple):
+    """Of a command."""
+
+    code: int
+    output: str
+    errors: str
+
+
+Command = Callable[..., Outcome]
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Outcome:
+    """Run the command line in this process; anything but SystemExit would be a traceback to the user."""
+    with pytest.raises(SystemExit) as stop:
+        run([str(argument) for argument in arguments])
+    output, errors = capsys.readouterr()
+    return Outcome(int(stop.value.code or 0), output, errors)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command line."""
+    return lambda *arguments: call(capsys, *arguments)
+
+
+def assert_one_line(outcome: Outcome, *parts: str) -> None:
+    """Exit code 2, nothing on standard output, one line on standard error that holds the parts."""
+    assert (outcome.code, outcome.output) == (2, "")
+    (line,) = (
+        line for line in outcome.errors.splitlines() if line and not line.startswith(("Usage:", "Try "))
+    )
+    assert line.lower().startswith("error: ")
+    for part in parts:
+        assert part in line
+
+
+# --- names and values that do not exist -------------------------------------------------------------------
+
+TRAIN = ["train", "--task", TASK, "--model", "m3gn", "--preset", "smoke", "--tier", "smoke", "--out", "run"]
+EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["generate", "bending"], ["task 'bending'", "known: sheet_deformation, sheet_deformation_ood"]),
+        (["generate", TASK, "--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
+        (["generate", TASK, "--fidelity", "best"], ["fidelity 'best'", "known: default, fast, reference"]),
+        (["generate", TASK, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
+        (["generate", TASK, "--workers", "0"], ["workers must be at least 1"]),
+        (["generate", TASK, "--workers", "two"], ["'two' is not a valid integer"]),
+        ([*TRAIN, "--task", "bending"], ["task 'bending'", "known: sheet_deformation,"]),
+        ([*TRAIN, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
+        ([*TRAIN, "--preset", "big"], ["preset 'big'", "known: compact, paper, smoke"]),
+        ([*TRAIN, "--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
+        ([*TRAIN, "--set", "training.foo=1"], ["'training.foo'", "known: ", "training.learning_rate"]),
+        ([*TRAIN, "--set", "model.foo=1"], ["'model.foo'", "known: ", "model.width"]),
+        ([*TRAIN, "--set", "training.learning_rate=-1"], ["learning_rate", "greater than 0"]),
+        ([*TRAIN, "--set", "training.learning_rate=high"], ["TOML"]),
+        ([*TRAIN, "--set", "training.learning_rate"], ["KEY=VALUE"]),
+        ([*TRAIN, "--steps", "0"], ["steps", "greater than 0"]),
+        ([*EVALUATE, "--task", "bending"], ["task 'bending'", "known: sheet_deformation,"]),
+        ([*EVALUATE, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
+        ([*EVALUATE, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
+        ([*EVALUATE, "--preset", "big"], ["preset big", "--checkpoint"]),
+        (["leaderboard", "show", "--task", "bending"], ["task 'bending'", "known: sheet_deformation,"]),
+        (["simulate"], ["No such command 'simulate'"]),
+        (["generate"], ["Missing argument 'TASK'"]),
+        (["info", "absent.h5"], ["no dataset file at absent.h5"]),
+    ],
+    ids=lambda value: " ".join(value[-2:]) if isinstance(value, list) else None,
+)
+def test_unknown_names_list_what_exists(
+    command: Command, arguments: list[str], parts: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # an empty folder, so nothing but the arguments can be at fault
+    assert_one_line(command(*arguments), *parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_budget(command: Command, smoke_file: Path, tmp_path: Path) -> None:
+    outcome = command(*TRAIN[:-1], tmp_path, "--data", smoke_file.parent)
+    assert_one_line(outcome, "budget", "training.minutes", "training.steps")
+
+
+def test_folder_of_data_is_a_file(command: Command, smoke_file: Path) -> None:
+    assert_one_line(command("generate", TASK, "--tier", "smoke", "--out", smoke_file), "is a file")
+
+
+# --- files that are no datasets ---------------------------------------------------------------------------
+
+
+def not_a_number(key: str, trajectory: Trajectory) -> Trajectory:
+    trajectory.positions[1, 1, 1] = np.nan
+    return trajectory
+
+
+def inverted(key: str, trajectory: Trajectory) -> Trajectory:
+    trajectory.mesh.cells[:] = trajectory.mesh.cells[:, [1, 0, 2, 3]]
+    return trajectory
+
+
+@pytest.fixture(scope="module")
+def bad_files(
+    tmp_path_factory: pytest.TempPathFactory, write_tetra: TetraWriter, tetra_metadata: Metadata
+) -> Path:
+    """A folder of damaged and foreign files."""
+    folder = tmp_path_factory.mktemp("bad")
+    valid = write_tetra(folder / "valid.h5")
+    content = valid.read_bytes()
+    (folder / "truncated").write_bytes(content[: len(content) // 2])
+    (folder / "text").write_text("positions,1,2,3\n")
+    with h5py.File(folder / "foreign", "w") as file:
+        file["data"] = np.arange(3)
+    with h5py.File(valid) as file:
+        offset = file["trajectories/train_00001/positions"].id.get_chunk_info(0).byte_offset
+    (folder / "bit-flipped").write_bytes(
+        content[: offset + 40] + bytes([content[offset + 40] ^ 1]) + content[offset + 41 :]
+    )
+    shutil.copy(valid, folder / "wrong-version")
+    with h5py.File(folder / "wrong-version", "r+") as file:
+        file.attrs["schema_version"] = 99
+    shutil.copy(valid, folder / "damaged-attribute")
+    with h5py.File(folder / "damaged-attribute", "r+") as file:
+        file.attrs["tier"] = "huge"
+    write_tetra(folder / "nan", change=not_a_number)
+    write_tetra(folder / "negative-volume", change=inverted)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("truncated", "E001 */: .*truncated or damaged"),
+        ("text", "E001 */: .*cannot be opened as HDF5"),
+        ("foreign", "E001 */: .*no m3gn-bench dataset"),
+        ("bit-flipped", "E003 */trajectories/train_00001: .*damaged"),
+        ("wrong-version", "E001 */: .*schema version 99, this m3gn-bench reads 1"),
+        ("damaged-attribute", "E002 */: .*root attributes: tier"),
+        ("nan", "E005 */trajectories/test_00000: positions holds 1 numbers that are not finite"),
+        ("negative-volume", r"E007 */trajectories/test_00000: .*volume -0\.\d+"),
+        ("absent", "E001 */: no dataset file at"),
+    ],
+)
+def test_validate_names_the_problem(command: Command, bad_files: Path, name: str, message: str) -> None:
+    outcome = command("validate", bad_files / name)
+    assert (outcome.code, outcome.errors) == (1, "")
+    first, *_, last = outcome.output.splitlines()
+    assert re.match(message, first), first
+    assert last.endswith("NOT valid")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("truncated", "truncated or damaged"),
+        ("text", "cannot be opened as HDF5"),
+        ("foreign", "no m3gn-bench dataset"),
+        ("wrong-version", "schema version 99"),
+        ("damaged-attribute", "root attributes: tier"),
+        (".", "no dataset file at"),
+    ],
+)
+def test_info_of_files_that_are_no_datasets(
+    command: Command, bad_files: Path, name: str, message: str
+) -> None:
+    assert_one_line(command("info", bad_files / name), message, str(bad_files / name))
+
+
+# --- checkpoints ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, smoke_file: Path) -> Path:
+    """A checkpoint of the smallest M3GN after two steps."""
+    folder = tmp_path_factory.mktemp("run")
+    arguments = [*TRAIN[:-1], str(folder), "--steps", "2", "--data", str(smoke_file.parent)]
+    with pytest.raises(SystemExit) as stop:
+        run([*arguments, "--set", "training.validation_trajectories=1"])
+    assert not stop.value.code
+    return folder
+
+
+@pytest.fixture
+def checkpoint(trained: Path, tmp_path: Path) -> Path:
+    """A checkpoint that a test may damage."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def flip_bit(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (lambda folder: shutil.rmtree(folder), ["no checkpoint in"]),
+        (lambda folder: (folder / "checkpoint.json").unlink(), ["checkpoint.json is missing"]),
+        (lambda folder: (folder / "checkpoint.json").write_text("{"), ["checkpoint.json is damaged"]),
+        (
+            lambda folder: (folder / "checkpoint.json").write_bytes(b"\xff\x00"),
+            ["checkpoint.json is damaged"],
+        ),
+        (lambda folder: (folder / "weights.safetensors").unlink(), ["cannot read", "weights.safetensors"]),
+        (lambda folder: flip_bit(folder / "weights.safetensors"), ["does not match the SHA-256"]),
+        (
+            lambda folder: edit_json(folder / "checkpoint.json", lambda r: r["config"].pop("model_name")),
+            ["checkpoint.json is damaged"],
+        ),
+        (
+            lambda folder: edit_json(folder / "checkpoint.json", lambda r: r["config"].pop("training")),
+            ["does not fit this version"],
+        ),
+        (
+            lambda folder: edit_json(
+                folder / "checkpoint.json", lambda r: r["config"]["model"].update(width=8)
+            ),
+            ["does not fit this version"],
+        ),
+        (
+            lambda folder: edit_json(
+                folder / "checkpoint.json", lambda r: r["config"]["model"].update(foo=8)
+            ),
+            ["does not fit this version"],
+        ),
+    ],
+    ids=[
+        "no folder",
+        "no description",
+        "description cut off",
+        "description binary",
+        "no weights",
+        "weights damaged",
+        "description without model",
+        "description without training",
+        "other width",
+        "unknown parameter",
+    ],
+)
+def test_damaged_checkpoints(
+    command: Command,
+    checkpoint: Path,
+    smoke_file: Path,
+    damage: Callable[[Path], object],
+    parts: list[str],
+) -> None:
+    damage(checkpoint)
+    outcome = command(*EVALUATE, "--checkpoint", checkpoint, "--data", smoke_file.parent, "--threads", 1)
+    assert_one_line(outcome, *parts)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--model", "mgn"], ["holds a m3gn, not a mgn"]),
+        (["--task", "sheet_deformation_ood"], ["trained on sheet_deformation, not on sheet_deformation_ood"]),
+        (["--contexts", "1"], ["context size 1 is out of range", "51 frames", "2 to 50"]),
+        (["--contexts", "51"], ["context size 51 is out of range", "2 to 50"]),
+        (["--contexts", "2,-3"], ["context size -3 is out of range"]),
+        (["--contexts", "a,b"], ["--contexts 'a,b' is no list of numbers"]),
+        (["--contexts", ""], ["--contexts '' is no list of numbers"]),
+        (["--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
+    ],
+    ids=lambda value: " ".join(value) if "--" in value[0] else None,
+)
+def test_evaluate_refuses(
+    command: Command, trained: Path, smoke_file: Path, arguments: list[str], parts: list[str]
+) -> None:
+    outcome = command(
+        *EVALUATE, "--checkpoint", trained, "--data", smoke_file.parent, "--threads", 1, *arguments
+    )
+    assert_one_line(outcome, *parts)
+
+
+def test_training_does_not_overwrite_another_run(command: Command, trained: Path, smoke_file: Path) -> None:
+    before = (trained / "checkpoint.json").read_bytes()
+    outcome = command(*TRAIN[:-1], trained, "--steps", 3, "--data", smoke_file.parent)
+    assert_one_line(outcome, "another finished run", "use another folder")
+    assert (trained / "checkpoint.json").read_bytes() == before
+
+
+def test_damaged_data_is_not_trained_on(command: Command, smoke_file: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    copy = Path(shutil.copy(smoke_file, data))
+    with h5py.File(copy, "r+") as file:
+        file["trajectories/train_00003/loads/nodal_forces"][100, 2] += np.float32(1)
+    outcome = command(*TRAIN[:-1], tmp_path / "run", "--steps", 2, "--data", data)
+    assert_one_line(outcome, "train_00003 does not match its content hash")
+    assert not (tmp_path / "run").exists()
+
+
+# --- output for programs ----------------------------------------------------------------------------------
+
+
+def parse(outcome: Outcome, code: int = 0) -> dict[str, Any]:
+    """The one JSON object that is all of standard output."""
+    assert (outcome.code, outcome.errors) == (code, "")
+    record = json.loads(outcome.output)
+    assert isinstance(record, dict)
+    return record
+
+
+def test_list_as_json(command: Command) -> None:
+    record = parse(command("list", "--json"))
+    assert record["tiers"] == ["smoke", "quick", "paper"]
+    tasks = {task["name"]: task for task in record["tasks"]}
+    assert set(tasks) == {"sheet_deformation", "sheet_deformation_ood"}
+    assert tasks[TASK]["tiers"]["paper"] == {"train": 630, "validation": 135, "test": 135}
+    models = {(m["name"], m["preset"], m["task"]): m["parameters"] for m in record["models"]}
+    names = {name for name, *_ in models}
+    assert {"m3gn", "mgn", "stand_still"} <= names
+    assert len(models) == len(record["models"]) == len(names) * 3 * len(tasks)
+    assert models["stand_still", "paper", TASK] == 0
+    assert 0 < models["m3gn", "smoke", TASK] < models["m3gn", "compact", TASK] < models["m3gn", "paper", TASK]
+
+
+def test_generate_as_json(command: Command, smoke_file: Path, tmp_path: Path) -> None:
+    arguments = ["generate", TASK, "--tier", "smoke", "--split", "test", "--workers", 1, "--out", tmp_path]
+    record = parse(command(*arguments, "--fidelity", "fast", "--json"))
+    path = Path(record["file"])
+    assert path == tmp_path / "sheet_deformation-smoke-test-fast.h5"
+    assert (record["trajectories"], record["generated"], record["rejected"]) == (4, 4, [])
+    assert record["cpu_seconds_per_trajectory"] > 0
+    assert record["megabytes"] == pytest.approx(path.stat().st_size / 1e6)
+    with open_file(path) as file:
+        assert record["content_hash"] == read_metadata(file).content_hash
+
+
+def test_validate_as_json(command: Command, smoke_file: Path, bad_files: Path) -> None:
+    record = parse(command("validate", smoke_file, "--strict", "--json"))
+    assert record == {"file": str(smoke_file), "trajectories": 16, "ok": True, "problems": []}
+    record = parse(command("validate", bad_files / "bit-flipped", "--json"), code=1)
+    assert record["ok"] is False
+    assert record["problems"][0]["code"] == "E003"
+    assert record["problems"][0]["where"] == "/trajectories/train_00001"
+    assert all(set(problem) == {"code", "where", "message"} for problem in record["problems"])
+
+
+def test_info_as_json(command: Command, smoke_file: Path) -> None:
+    record = parse(command("info", smoke_file, "--json"))
+    with open_file(smoke_file) as file:
+        metadata = read_metadata(file)
+    assert record["content_hash"] == metadata.content_hash
+    assert record["tier_hashes"] == {"smoke": metadata.content_hash}
+    assert (record["scene"], record["seed"], record["frames"], record["transitions"]) == (TASK, 2025, 51, 50)
+    assert record["splits"][TASK] == {"train": 8, "validation": 4, "test": 4}
+    assert set(record["simulator_versions"]) == {"scikit-fem", "scipy", "numpy"}
+
+
+def test_train_and_evaluate_as_json(command: Command, trained: Path, smoke_file: Path) -> None:
+    data = ["--data", smoke_file.parent, "--json"]
+    settings = ["--steps", 2, "--set", "training.validation_trajectories=1"]
+    record = parse(command(*TRAIN[:-1], trained, *settings, *data))  # done already: tells of what is there
+    assert (record["checkpoint"], record["steps"]) == (str(trained), 2)
+    scores = parse(command(*EVALUATE, "--checkpoint", trained, *data, "--threads", 1, "--contexts", "2,50"))
+    assert [(row["context"], row["trajectories"]) for row in scores["results"]] == [(2, 4), (50, 4)]
+    assert all(0 < row["mse"] < row["mse_free_nodes"] for row in scores["results"])

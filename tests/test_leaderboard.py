@@ -1,0 +1,173 @@
+"""Records, tables, and the check: it must pass on the truth and fail on every planted error."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.generators import sheet_deformation
+from m3gn_bench.leaderboard import check, record, render
+from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
+from safetensors.torch import load_file, save_file
+
+from m3gn_bench import sources
+from m3gn_bench.checkpoint import read_description
+from m3gn_bench.cli import run
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory, smoke_file: Path) -> Path:
+    """A leaderboard of two models, made by the commands that make the real one."""
+    home = tmp_path_factory.mktemp("board")
+    data = ["--data", str(smoke_file.parent), "--tier", "smoke"]
+    for model in ("mgn", "stand_still"):
+        folder = checkpoint_folder("sheet_deformation", model, "smoke", home=home)
+        task = ["--task", "sheet_deformation", "--model", model]
+        for command in (
+            ["train", *task, *data, "--preset", "smoke", "--steps", "3", "--out", str(folder)],
+            ["evaluate", *task, *data, "--checkpoint", str(folder), "--record", str(home), "--track", "test"],
+        ):
+            with pytest.raises(SystemExit) as stop:
+                run(command)
+            assert not stop.value.code
+    return home
+
+
+@pytest.fixture(autouse=True)
+def fresh_simulations() -> Iterator[None]:
+    """Planted errors in a generator must not survive in the cache, nor the truth hide them."""
+    sources._simulate.cache_clear()
+    yield
+    sources._simulate.cache_clear()
+
+
+@pytest.fixture
+def use_board(board: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=board))
+    return board
+
+
+def run_check(records: list[ResultRecord]) -> check.CheckReport:
+    return check.check_records(records, trajectories=1, offset=0)
+
+
+def test_check_rederives_every_number(use_board: Path) -> None:
+    report = run_check(read_records(use_board))
+    assert report.ok, report
+    assert len(report.compared) == 2 * 3  # models, context sizes
+    assert all(c.same_trajectory for c in report.compared)
+
+
+def test_planted_error_in_a_record_is_found(use_board: Path) -> None:
+    records = read_records(use_board)
+    wrong = records[0].model_dump()
+    wrong["results"][1]["trajectory_mse"] = [value * 1.01 for value in wrong["results"][1]["trajectory_mse"]]
+    report = run_check([ResultRecord.model_validate(wrong), *records[1:]])
+    assert not report.ok
+    assert sum(not c.ok for c in report.compared) == 1
+
+
+def test_planted_error_in_a_generator_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sheet_deformation, "THICKNESS", 2.02)
+    report = run_check(read_records(use_board))
+    assert not report.ok
+    assert not any(c.same_trajectory for c in report.compared)
+
+
+def test_planted_error_in_weights_is_found(use_board: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkpoint that was replaced is not the recorded one, even if it is consistent in itself."""
+    original = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=use_board)
+    weights = load_file(original / "weights.safetensors")
+    weights["network.readout.bias"] += 1e-3
+    save_file(weights, tmp_path / "weights.safetensors")
+    (tmp_path / "checkpoint.json").write_bytes((original / "checkpoint.json").read_bytes())
+    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: tmp_path)
+    with pytest.raises(BenchError, match="SHA-256"):
+        run_check([r for r in read_records(use_board) if r.model == "mgn"])
+
+
+def test_planted_error_in_a_model_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from m3gn_bench.baselines.mgn import MeshGraphNet
+
+    original = MeshGraphNet._step
+    monkeypatch.setattr(MeshGraphNet, "_step", lambda self, *args: 1.01 * original(self, *args))
+    report = run_check([r for r in read_records(use_board) if r.model == "mgn"])
+    assert not report.ok
+
+
+def test_missing_checkpoint_and_empty_board_are_problems(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not run_check([]).ok
+    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: use_board / "nowhere")
+    report = run_check(read_records(use_board))
+    assert not report.ok
+    assert "does not ship" in report.problems[0]
+
+
+def test_record_says_where_its_numbers_come_from(board: Path) -> None:
+    stored = next(r for r in read_records(board) if r.model == "mgn")
+    assert stored.checkpoint == read_description(checkpoint_folder("sheet_deformation", "mgn", "smoke", home=board))
+    for result in stored.results:
+        assert result.mse == pytest.approx(np.mean(result.trajectory_mse), rel=1e-6)
+        assert result.ci95[0] <= result.mse <= result.ci95[1]
+        assert result.mse_free_nodes == pytest.approx(result.mse * 225 / 169, rel=1e-5)  # 56 clamped nodes
+        assert len(result.per_timestep_mse) == 51 - result.context
+        assert np.mean(result.per_timestep_mse) == pytest.approx(result.mse, rel=1e-6)
+
+
+def test_recorded_error_over_a_prefix(board: Path) -> None:
+    stored = read_records(board)[0]
+    result = stored.results[0]
+    assert stored.mse_over(2, stored.keys[:2]) == pytest.approx(np.mean(result.trajectory_mse[:2]))
+    assert stored.mse_over(2, ["test_99999"]) is None
+    assert stored.mse_over(3, stored.keys) is None
+
+
+def test_records_round_trip_and_bad_ones_are_named(board: Path, tmp_path: Path) -> None:
+    stored = read_records(board)[0]
+    path = write_record(stored, tmp_path)
+    assert read_records(tmp_path) == [stored]
+    content = json.loads(path.read_text())
+    del content["dataset_hash"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(BenchError, match=rf"{path.name}.*dataset_hash"):
+        read_records(tmp_path)
+
+
+def test_page_holds_every_recorded_number_in_order(board: Path) -> None:
+    records = read_records(board)
+    page = render.render(records)
+    rows = [line for line in page.splitlines() if line.startswith(("| mgn ", "| stand_still "))]
+    assert len(rows) == 4
+    for stored in records:
+        assert f"{stored.results[0].mse * 1e6:.3g}" in page
+    better, worse = sorted(records, key=lambda r: r.results[1].mse)
+    assert page.index(f"| {better.model} ") < page.index(f"| {worse.model} ")
+
+
+def test_shipped_records_and_page_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    """The committed page is what the committed records give, and every record has its checkpoint."""
+    with pytest.raises(SystemExit) as stop:
+        run(["leaderboard", "render", "--check"])
+    assert stop.value.code == 0, capsys.readouterr().out
+    shipped = read_records()
+    assert shipped
+    for stored in shipped:
+        folder = record.checkpoint_folder(stored.task, stored.model, stored.preset, stored.seed)
+        assert read_description(folder) == stored.checkpoint
+
+
+def test_evaluation_is_deterministic(board: Path, smoke_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=board)
+    outputs = []
+    for _ in range(2):
+        arguments = ["--checkpoint", str(folder), "--tier", "smoke", "--data", str(smoke_file.parent), "--json"]
+        with pytest.raises(SystemExit):
+            run(["evaluate", "--model", "mgn", "--threads", "1", *arguments])
+        outputs.append(json.loads(capsys.readouterr().out)["results"])
+    assert outputs[0] == outputs[1]
+    assert {"task", "model", "preset", "seed", "context", "mse", "mse_free_nodes", "ci95"} <= set(outputs[0][0])
+    assert {"per_timestep_mse", "trajectories", "recorded_mse"} <= set(outputs[0][0])
+    assert torch.isfinite(torch.tensor([row["mse"] for row in outputs[0]])).all()
