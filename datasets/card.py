@@ -6,6 +6,7 @@ A card is Markdown written by people, with one block between two markers that be
 from pathlib import Path
 
 import numpy as np
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import (
     content_hash,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.schema import (
     DATASET_SEED,

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+from torch.utils.data import Dataset
+
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.file import open_file, read_metadata, read_splits, read_trajectory
 from m3gn_bench.datasets.schema import Split, in_tier, tier_sizes
 from m3gn_bench.datasets.trajectory import Trajectory
-from torch.utils.data import Dataset
 
 
 class TrajectoryDataset(Dataset[Trajectory]):

@@ -20,8 +20,9 @@ import json
 from typing import Any, Literal, get_args
 
 import numpy as np
-from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from pydantic import BaseModel, ConfigDict, Field
+
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
 
 FORMAT = "m3gn-bench dataset"
 SCHEMA_VERSION = 1

@@ -9,6 +9,7 @@ from typing import Literal
 
 import h5py
 import numpy as np
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import load_trajectory, open_file, read_metadata, read_splits
 from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, tier_sizes, trajectory_key

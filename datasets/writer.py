@@ -13,6 +13,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.schema import Metadata, Rejection, Split, as_text, fixed_length
 from m3gn_bench.datasets.trajectory import Trajectory, combine_hashes, hash_arrays

@@ -18,6 +18,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
+
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
 from m3gn_bench.datasets.schema import (
@@ -33,8 +35,6 @@ from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.scene import Fidelity, Scene, get_scene
-from threadpoolctl import threadpool_limits
-
 from m3gn_bench.version import __version__
 
 MAX_ATTEMPTS = 10

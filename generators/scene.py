@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
+
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import Trajectory

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from typing import ClassVar
 
 import numpy as np
+
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
 from m3gn_bench.generators.scene import Fidelity

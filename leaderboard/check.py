@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Sequence
 
-from m3gn_bench.datasets.schema import Record
-from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder
-
 from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.datasets.schema import Record
 from m3gn_bench.evaluation import evaluate_model
+from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder
 from m3gn_bench.sources import regenerate
 from m3gn_bench.tasks import get_task
 

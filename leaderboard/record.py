@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from m3gn_bench.datasets.errors import BenchError
-from m3gn_bench.datasets.schema import Record
-from m3gn_bench.datasets.writer import write_bytes_atomically
 from pydantic import ValidationError
 
 from m3gn_bench.checkpoint import Checkpoint
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.metrics import TrajectoryErrors, confidence_interval
 
 HOME = Path(__file__).parent
@@ -104,10 +104,11 @@ def checkpoint_folder(task: str, model: str, preset: str, seed: int = 0, home: P
 
 
 def write_record(record: ResultRecord, home: Path = HOME) -> Path:
-    """Write a record to its place, numbers rounded to nine digits."""
+    """Write a record to its place, errors rounded to nine digits."""
     path = record_path(record, home)
-    rounded = _rounded(record.model_dump(mode="json"))
-    write_bytes_atomically(path, (json.dumps(rounded, indent=1) + "\n").encode())
+    content = record.model_dump(mode="json")
+    content["results"] = _rounded(content["results"])
+    write_bytes_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
     return path
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 
 from m3gn_bench.leaderboard.record import HOME, ResultRecord
-
 from m3gn_bench.tasks import TASKS
 
 TABLE = HOME / "LEADERBOARD.md"

@@ -527,10 +527,17 @@ def evaluate(
     report.finish(
         {"model": model, "tier": tier, "split": split, "results": rows},
         table(
-            f"{model}: full-rollout MSE x 1e6 over {rows[0]['trajectories']} trajectories and more"
-            if len({row["trajectories"] for row in rows}) > 1
-            else f"{model}: full-rollout MSE x 1e6 over {rows[0]['trajectories']} {split} trajectories",
-            ["task", "context", "mse", "95 % interval", "free nodes", "recorded", "difference"],
+            f"{model}: full-rollout MSE x 1e6, {split} split",
+            [
+                "task",
+                "context",
+                "mse",
+                "95 % interval",
+                "free nodes",
+                "trajectories",
+                "recorded",
+                "difference",
+            ],
             [
                 [
                     row["task"],
@@ -538,6 +545,7 @@ def evaluate(
                     f"{row['mse'] * 1e6:.4g}",
                     f"{row['ci95'][0] * 1e6:.3g} .. {row['ci95'][1] * 1e6:.3g}",
                     f"{row['mse_free_nodes'] * 1e6:.4g}",
+                    row["trajectories"],
                     *(
                         ("none", "")
                         if row["recorded_mse"] is None

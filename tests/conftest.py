@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 import pytest
+
 from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, SPLITS, Metadata, Tier, trajectory_key
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TETRA, Mesh, Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 import pytest
 from conftest import TetraWriter
+
+from m3gn_bench.cli import run
 from m3gn_bench.datasets.file import open_file, read_metadata
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import Trajectory
-
-from m3gn_bench.cli import run
 
 TASK = "sheet_deformation"
 

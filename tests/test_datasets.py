@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import TetraWriter
+from torch.utils.data import DataLoader
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import (
     content_hash,
@@ -28,7 +30,6 @@ from m3gn_bench.datasets.trajectory import Mesh, Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.sheet_deformation import YOUNGS_MODULI, SheetDeformation
-from torch.utils.data import DataLoader
 
 TASK = "tetra_task"
 

@@ -9,11 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
+import h5py
 import numpy as np
 import pytest
+
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import content_hash, find_dataset, open_file, read_metadata, stored_hashes
 from m3gn_bench.datasets.schema import DATASET_SEED, SPLITS
@@ -79,6 +82,7 @@ class FakeScene:
 class HopelessScene(FakeScene):
     """No draw is ever good."""
 
+    name: ClassVar[str] = "hopeless"
     limits: ClassVar[tuple[float, float]] = (1.0, 1.0)
 
 
@@ -133,6 +137,19 @@ def test_whatever_is_not_the_default_is_in_the_name(fake: FakeScene, tmp_path: P
     assert find_dataset(tmp_path, "fake", "smoke", SPLITS) is None
 
 
+def test_all_draws_differ(fake: FakeScene) -> None:
+    """A test trajectory that equals a training one would spoil the benchmark."""
+    draws = [
+        draw(scene, split, index, seed, attempt)  # type: ignore[arg-type]
+        for scene in (fake, HopelessScene())
+        for split in SPLITS
+        for index in range(20)
+        for seed in (DATASET_SEED, 1)
+        for attempt in range(MAX_ATTEMPTS)
+    ]
+    assert len(set(draws)) == len(draws)
+
+
 # --- rejected draws ---------------------------------------------------------------------------------------
 
 
@@ -158,10 +175,10 @@ def test_rejected_draws_are_counted_and_redrawn(fake: FakeScene, tmp_path: Path)
 
 
 def test_hopeless_draws_end_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(scenes._SCENES, "fake", f"{__name__}:HopelessScene")
+    monkeypatch.setitem(scenes._SCENES, "hopeless", f"{__name__}:HopelessScene")
     message = rf"train_00000: all {MAX_ATTEMPTS} draws were rejected, the last because diverges at 0\.\d+"
     with pytest.raises(GeneratorError, match=message):
-        generate("fake", "smoke", tmp_path)
+        generate("hopeless", "smoke", tmp_path)
     assert list(tmp_path.glob("*.h5")) == []
 
 
@@ -198,7 +215,9 @@ def test_damaged_shards_are_made_again(fake: FakeScene, tmp_path: Path) -> None:
         generate("fake", "smoke", tmp_path, on_progress=stop_after(5))
     shards = sorted(tmp_path.glob(".*.shards/*.h5"))
     shards[0].write_bytes(shards[0].read_bytes()[:-100])
-    assert generate("fake", "smoke", tmp_path).generated == 16 - 4
+    with h5py.File(shards[1], "r+") as file:
+        file["trajectories/train_00001/positions"][0, 0, 0] = 9
+    assert generate("fake", "smoke", tmp_path).generated == 16 - 3
 
 
 def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
@@ -238,7 +257,8 @@ def run() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
     yield start_one
     for process in started:
-        process.kill()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its workers, too, should they outlive it
         process.communicate()
 
 

@@ -80,7 +80,9 @@ def test_predicts_every_frame_after_the_anchor(model: Model, size: int) -> None:
 def test_fixed_nodes_stay(model: Model) -> None:
     case = make_case(2)
     path = predict(model, case)
-    assert torch.equal(path[:, case.body.fixed], case.positions[:1, case.body.fixed].expand(len(path), -1, -1))
+    assert torch.equal(
+        path[:, case.body.fixed], case.positions[:1, case.body.fixed].expand(len(path), -1, -1)
+    )
 
 
 def test_future_frames_change_nothing(model: Model) -> None:

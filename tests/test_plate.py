@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate

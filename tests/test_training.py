@@ -24,7 +24,9 @@ class Killed(BaseException):
     """Stands for a kill: nothing in the loop may catch it."""
 
 
-def run(name: str, out: Path, steps: int, kill_at: int | None = None, seed: int = 0, **settings: object) -> Checkpoint:
+def run(
+    name: str, out: Path, steps: int, kill_at: int | None = None, seed: int = 0, **settings: object
+) -> Checkpoint:
     overrides = {"training.steps": steps, "training.validations": 3, **settings}
 
     def observe(progress: Progress) -> None:
@@ -65,7 +67,9 @@ def test_learns(name: str, tmp_path: Path) -> None:
     """Weights after some training beat those of the first step by far, on the data trained on."""
     errors = []
     for steps in (1, 300):
-        settings = {"training.steps": steps, "model.noise": 1e-3} if "mgn" in name else {"training.steps": steps}
+        settings = (
+            {"training.steps": steps, "model.noise": 1e-3} if "mgn" in name else {"training.steps": steps}
+        )
         config = load_preset(name, "smoke", TASK, settings)
         done = train(config, TASK, CASES, CASES, tmp_path / str(steps), seed=0, dataset_hash="none")
         errors.append(done.validation_error)

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import Change, TetraWriter
+
 from m3gn_bench.datasets.file import open_file, read_metadata, read_splits, read_trajectory
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import VTK_TRIANGLE, Trajectory

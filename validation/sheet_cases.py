@@ -3,6 +3,8 @@
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
+
 from m3gn_bench.generators.scene import Fidelity
 from m3gn_bench.generators.sheet_deformation import (
     FORCE,
@@ -16,7 +18,6 @@ from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate
 from m3gn_bench.generators.solvers.quasistatic import load_path
 from m3gn_bench.generators.solvers.sparse import Array
-from scipy.spatial import cKDTree
 
 CENTRES = ((50.0, 60.0), (95.0, 85.0))  # [mm], one on a node and one amid a cell, with no symmetry
 SAME = (-FORCE, -FORCE)

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from m3gn_bench.generators.sheet_deformation import LOAD_RADIUS, POISSON_RATIO, SIDE, THICKNESS
-from m3gn_bench.generators.solvers.sparse import Array
 from sheet_cases import CENTRES, OPPOSITE, SAME, at_recorded_nodes, case, displacements, relative_error
 from skfem import Basis, ElementQuadS2, MeshQuad
+
+from m3gn_bench.generators.sheet_deformation import LOAD_RADIUS, POISSON_RATIO, SIDE, THICKNESS
+from m3gn_bench.generators.solvers.sparse import Array
 
 CELLS_PER_SIDE = 28  # two per recorded cell
 

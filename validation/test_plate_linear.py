@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from skfem import Basis, BilinearForm
+
 from m3gn_bench.generators.solvers.plate import ClampedPlate
 from m3gn_bench.generators.solvers.sparse import Array
-from skfem import Basis, BilinearForm
 
 SIDE = 140.0
 CENTRE = (SIDE / 2, SIDE / 2)

@@ -2,12 +2,6 @@
 
 import numpy as np
 import pytest
-from m3gn_bench.generators.scene import Fidelity
-from m3gn_bench.generators.sheet_deformation import INCREMENTS, SheetDeformation
-from m3gn_bench.generators.solvers.newton import ModifiedNewton
-from m3gn_bench.generators.solvers.plate import ClampedPlate
-from m3gn_bench.generators.solvers.quasistatic import load_path
-from m3gn_bench.generators.solvers.sparse import Array
 from scipy.spatial.transform import Rotation
 from sheet_cases import (
     OPPOSITE,
@@ -19,6 +13,13 @@ from sheet_cases import (
     relative_error,
     worst_frame_error,
 )
+
+from m3gn_bench.generators.scene import Fidelity
+from m3gn_bench.generators.sheet_deformation import INCREMENTS, SheetDeformation
+from m3gn_bench.generators.solvers.newton import ModifiedNewton
+from m3gn_bench.generators.solvers.plate import ClampedPlate
+from m3gn_bench.generators.solvers.quasistatic import load_path
+from m3gn_bench.generators.solvers.sparse import Array
 
 MESH_ERROR = 0.005  # relative L2, what the scene's mesh may be off
 

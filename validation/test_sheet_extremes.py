@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from sheet_cases import OPPOSITE, SAME, displacements, relative_error
+
 from m3gn_bench.generators.generate import DATASET_SEED
 from m3gn_bench.generators.sheet_deformation import (
     LOAD_MARGIN,
@@ -13,7 +15,6 @@ from m3gn_bench.generators.sheet_deformation import (
     SheetParameters,
 )
 from m3gn_bench.generators.solvers.sparse import Array
-from sheet_cases import OPPOSITE, SAME, displacements, relative_error
 
 Centres = tuple[tuple[float, float], tuple[float, float]]
 

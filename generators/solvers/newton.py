@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from m3gn_bench.generators.errors import SolverError
-from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler, BandedCholesky
 from scipy.linalg import LinAlgError
 
+from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler, BandedCholesky
 
 SHORTEST_STEP = 2**-12  # of a Newton step; a line search that goes below has failed
 

@@ -16,8 +16,9 @@ Units are free but must be consistent; the scenes use N, mm and MPa.
 from functools import cached_property
 
 import numpy as np
-from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler
 from skfem import Basis, ElementQuadBFS, MeshQuad
+
+from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler
 
 GAUSS_POINTS = 3  # per direction; four change no scene by more than its discretisation error
 LOAD_GAUSS_POINTS = 12  # the load's disc is smaller than two elements

@@ -1,6 +1,7 @@
 """Follow an equilibrium path while a dead load grows from zero: no inertia, no time scale."""
 
 import numpy as np
+
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.sparse import Array
