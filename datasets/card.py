@@ -53,8 +53,14 @@ def numbers(path: Path) -> str:
         ("frames, transitions", f"{metadata.frames}, {metadata.transitions}"),
         ("nodes, cells", f"{len(mesh.rest_positions)}, {len(mesh.cells)}"),
         ("time step", f"{metadata.dt:g} ({metadata.time_unit})"),
-        ("lengths", f"{metadata.length_unit}; models see (x - {metadata.scale_centre}) / {metadata.scale_length:g}"),
-        ("movement per step, scaled", f"mean {_vector(moved.mean((0, 1, 2)))}, std {_vector(moved.std((0, 1, 2)))}"),
+        (
+            "lengths",
+            f"{metadata.length_unit}; models see (x - {metadata.scale_centre}) / {metadata.scale_length:g}",
+        ),
+        (
+            "movement per step, scaled",
+            f"mean {_vector(moved.mean((0, 1, 2)))}, std {_vector(moved.std((0, 1, 2)))}",
+        ),
         ("rejected draws", "; ".join(f"{r.key}: {r.reason}" for r in metadata.rejections) or "0"),
         ("CPU time per trajectory", _range(diagnostics.pop("cpu_seconds"), " s")),
         *((name.replace("_", " "), _range(values, "")) for name, values in diagnostics.items()),

@@ -16,6 +16,7 @@ from m3gn_bench.datasets.schema import (
     Metadata,
     as_text,
     in_tier,
+    parse_key,
     tier_sizes,
 )
 from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
@@ -147,7 +148,7 @@ def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str]
     hashes = stored_hashes(file)
     metadata = read_metadata(file)
     sizes = tier_sizes(tier or metadata.tier, metadata.paper_sizes)
-    chosen = {k: h for k, h in hashes.items() if in_tier(k, sizes) and k.rpartition("_")[0] in splits}
+    chosen = {k: h for k, h in hashes.items() if in_tier(k, sizes) and parse_key(k)[0] in splits}
     if tier is not None and len(chosen) != sum(sizes[s] for s in SPLITS if s in splits):
         raise DatasetError(f"{file.filename} does not hold the whole {tier} tier")
     return combine_hashes(chosen)

@@ -30,6 +30,7 @@ DATASET_SEED = 2025  # the leaderboard's
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
+Fidelity = Literal["fast", "default", "reference"]
 Tier = Literal["smoke", "quick", "paper"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
 SMALL_TIERS: dict[str, dict[Split, int]] = {
@@ -66,7 +67,7 @@ class Metadata(Record):
     paper_sizes: dict[Split, int]
     generator_version: str
     simulator_versions: dict[str, str]
-    fidelity: str
+    fidelity: Fidelity
     seed: int
     dt: float = Field(gt=0, allow_inf_nan=False)
     time_unit: str
@@ -130,12 +131,28 @@ def tier_sizes(tier: str, paper_sizes: dict[Split, int]) -> dict[Split, int]:
     return SMALL_TIERS[tier]
 
 
+def as_split(name: str) -> Split:
+    """The split of that name. Raises DatasetError listing the splits if there is none."""
+    for split in SPLITS:
+        if split == name:
+            return split
+    raise DatasetError(unknown_name("split", name, list(SPLITS)))
+
+
 def trajectory_key(split: str, index: int) -> str:
     """The name of trajectory `index` of a split inside a dataset file."""
     return f"{split}_{index:05d}"
 
 
+def parse_key(key: str) -> tuple[Split, int]:
+    """The inverse of `trajectory_key`. Raises DatasetError for anything else."""
+    split, _, index = key.rpartition("_")
+    if not index.isdecimal():
+        raise DatasetError(f"{key!r} is no trajectory's name, such as test_00012")
+    return as_split(split), int(index)
+
+
 def in_tier(key: str, sizes: dict[Split, int]) -> bool:
     """Whether the trajectory belongs to a tier of the given sizes (tiers are prefixes of one another)."""
-    split, _, index = key.rpartition("_")
-    return index.isdecimal() and int(index) < {str(name): size for name, size in sizes.items()}.get(split, 0)
+    split, index = parse_key(key)
+    return index < sizes[split]

@@ -71,7 +71,7 @@ def validate(
                 for done, key in enumerate(keys, 1):
                     problems += _trajectory_problems(file, key, metadata, hashes)
                     on_progress(done, count)
-                problems += _file_problems(file, metadata, hashes)
+                problems += _file_problems(file, metadata, set(keys), hashes)
     except DatasetError as error:
         problems.append(Problem(code="E001", where="/", message=str(error)))
     except Exception as error:  # HDF5 has no list of what it raises on damaged files
@@ -144,7 +144,7 @@ def _misfits(trajectory: Trajectory, metadata: Metadata) -> Iterator[str]:
     """Arrays of another shape or type than the schema's; None stands for any length."""
     mesh = trajectory.mesh
     frames, nodes, dimension = metadata.frames, mesh.rest_positions.shape[:1], metadata.dimension
-    expected = {
+    expected: dict[str, tuple[np.ndarray, tuple[int | None, ...], str]] = {
         "mesh/rest_positions": (mesh.rest_positions, (*nodes, dimension), "float32"),
         "mesh/cells": (mesh.cells, (None, None), "int32"),
         "mesh/node_type": (mesh.node_type, nodes, "uint8"),
@@ -171,7 +171,9 @@ def cell_volumes(positions: np.ndarray, cells: np.ndarray, cell_type: int) -> np
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1) / 2
 
 
-def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) -> Iterator[Problem]:
+def _file_problems(
+    file: h5py.File, metadata: Metadata, present: set[str], hashes: dict[str, str]
+) -> Iterator[Problem]:
     if combine_hashes(hashes) != metadata.content_hash:
         yield Problem(
             code="E009", where="/", message="the file's content hash does not match its trajectories'"
@@ -186,22 +188,22 @@ def _file_problems(file: h5py.File, metadata: Metadata, hashes: dict[str, str]) 
             where = f"/splits/{task}/{split}"
             if split not in SPLITS:
                 yield Problem(code="E010", where=where, message=f"unknown split; known: {', '.join(SPLITS)}")
-            missing = [key for key in keys if key not in hashes]
+            missing = [key for key in keys if key not in present]
             if missing:
-                yield Problem(
-                    code="E010", where=where, message=f"lists {missing[0]}, which is not in the file"
-                )
+                message = f"lists {missing[0]}, which is not in the file"
+                yield Problem(code="E010", where=where, message=message)
             if len(set(keys)) < len(keys) or {key.rpartition("_")[0] for key in keys} - {split}:
                 message = "lists a trajectory twice, or one of another split"
                 yield Problem(code="E010", where=where, message=message)
-    if not tasks:
-        yield Problem(code="E010", where="/splits", message="there are no splits")
+    unlisted = present - {key for splits in tasks.values() for keys in splits.values() for key in keys}
+    if unlisted:
+        yield Problem(code="E010", where="/splits", message=f"{min(unlisted)} is in no split of any task")
     sizes = tier_sizes(metadata.tier, metadata.paper_sizes)
     absent = [
         key
         for split in SPLITS
         for i in range(sizes[split])
-        if (key := trajectory_key(split, i)) not in hashes
+        if (key := trajectory_key(split, i)) not in present
     ]
     if absent:
         message = f"{len(absent)} trajectories of tier {metadata.tier} are not in the file, the first is {absent[0]}"

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.schema import Metadata, Rejection, Split, as_text, fixed_length
+from m3gn_bench.datasets.schema import Metadata, Rejection, Split, as_text, fixed_length, parse_key
 from m3gn_bench.datasets.trajectory import Trajectory, combine_hashes, hash_arrays
 
 LIBVER = "v110"  # HDF5 1.10 and later read it; the first format with checksums on everything but the arrays
@@ -120,8 +120,8 @@ def merge_shards(
                         source.copy(origin[name], group, name)
                 group["mesh"] = file[f"meshes/{mesh_name}"]
                 hashes[key] = as_text(origin.attrs["content_hash"])
-                split, _, _ = key.rpartition("_")
-                for task in tasks_of(split, dict(origin["material"].attrs)):  # type: ignore[arg-type]
+                split, _ = parse_key(key)
+                for task in tasks_of(split, dict(origin["material"].attrs)):
                     members.setdefault(f"splits/{task}/{split}", []).append(key)
                 rejections += Metadata.from_attributes(dict(source.attrs)).rejections
         for name, keys in members.items():

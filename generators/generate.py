@@ -25,6 +25,7 @@ from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
 from m3gn_bench.datasets.schema import (
     DATASET_SEED,
     SPLITS,
+    Fidelity,
     Metadata,
     Rejection,
     Split,
@@ -34,7 +35,7 @@ from m3gn_bench.datasets.schema import (
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
-from m3gn_bench.generators.scene import Fidelity, Scene, get_scene
+from m3gn_bench.generators.scene import Scene, get_scene
 from m3gn_bench.version import __version__
 
 MAX_ATTEMPTS = 10
@@ -245,7 +246,7 @@ def _make_shard(job: _Job) -> None:
         split,
         index,
         seed=metadata.seed,
-        fidelity=metadata.fidelity,  # type: ignore[arg-type]
+        fidelity=metadata.fidelity,
     )
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
 

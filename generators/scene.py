@@ -1,16 +1,14 @@
 """What a scene is, and which scenes there are."""
 
 from importlib import import_module
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from m3gn_bench.datasets.errors import unknown_name
-from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.generators.errors import GeneratorError
-
-Fidelity = Literal["fast", "default", "reference"]
 
 
 class Scene(Protocol):

@@ -13,9 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.scene import Fidelity
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate
 from m3gn_bench.generators.solvers.quasistatic import load_path
@@ -24,7 +23,9 @@ SIDE = 140.0  # [mm]
 THICKNESS = 2.0  # [mm]
 POISSON_RATIO = 0.3
 NODES_PER_SIDE = 15  # recorded; 10 mm apart
-BORDER_LAYER = 3.0  # [mm], a further line of nodes; at E = 10 MPa the sheet bends within about 2 mm of its clamp
+BORDER_LAYER = (
+    3.0  # [mm], a further line of nodes; at E = 10 MPa the sheet bends within about 2 mm of its clamp
+)
 FORCE = 200.0  # [N], each of the two
 LOAD_RADIUS = 10.0  # [mm]
 LOAD_MARGIN = 20.0  # [mm], forces keep this distance from the border

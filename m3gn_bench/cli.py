@@ -106,8 +106,8 @@ def list_command(as_json: bool) -> None:
                 [
                     t["name"],
                     t["frames"],
-                    ", ".join(map(str, t["context_sizes"])),  # type: ignore[arg-type]
-                    *("/".join(map(str, sizes.values())) for sizes in t["tiers"].values()),  # type: ignore[attr-defined]
+                    ", ".join(map(str, t["context_sizes"])),
+                    *("/".join(map(str, sizes.values())) for sizes in t["tiers"].values()),
                 ]
                 for t in tasks
             ],
@@ -151,24 +151,19 @@ def generate(
     as_json: bool,
 ) -> None:
     """Simulate TASK's dataset. A run that was interrupted goes on where it stopped."""
-    from m3gn_bench.datasets.errors import unknown_name
-    from m3gn_bench.datasets.schema import SPLITS
-    from m3gn_bench.errors import ConfigError
+    from m3gn_bench.datasets.schema import SPLITS, as_split
     from m3gn_bench.generators.generate import DATASET_SEED
     from m3gn_bench.generators.generate import generate as generate_dataset
     from m3gn_bench.tasks import get_task
 
     report = Report(as_json)
-    for split in splits:
-        if split not in SPLITS:
-            raise ConfigError(unknown_name("split", split, list(SPLITS)))
     with report.progress(f"simulating {task}") as on_progress:
         made = generate_dataset(
             get_task(task).scene,
             tier,
             out or data,
             workers=workers,
-            splits=splits or SPLITS,  # type: ignore[arg-type]
+            splits=[as_split(split) for split in splits] or SPLITS,
             fidelity=fidelity,  # type: ignore[arg-type]
             seed=DATASET_SEED if seed is None else seed,
             on_progress=on_progress,
@@ -416,10 +411,9 @@ def evaluate(
 
     from m3gn_bench.checkpoint import load_checkpoint, read_description
     from m3gn_bench.data import load_cases
-    from m3gn_bench.datasets.errors import unknown_name
     from m3gn_bench.datasets.file import content_hash, open_file, stored_hashes
-    from m3gn_bench.datasets.schema import SPLITS
-    from m3gn_bench.errors import CheckpointError, ConfigError
+    from m3gn_bench.datasets.schema import as_split
+    from m3gn_bench.errors import CheckpointError
     from m3gn_bench.evaluation import evaluate_model
     from m3gn_bench.leaderboard.record import (
         HASH_DIGITS,
@@ -437,8 +431,7 @@ def evaluate(
     report = Report(as_json)
     torch.set_num_threads(threads)
     get_model_class(model)
-    if split not in SPLITS:
-        raise ConfigError(unknown_name("split", split, list(SPLITS)))
+    part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
     if checkpoint is not None:
         described = read_description(checkpoint)
@@ -470,11 +463,11 @@ def evaluate(
                 task,
                 tier,
                 data,
-                splits=(split,),
+                splits=(part,),
                 workers=workers,
-                on_progress=on_progress,  # type: ignore[arg-type]
+                on_progress=on_progress,
             )
-        cases = load_cases(path, task, split, tier)  # type: ignore[arg-type]
+        cases = load_cases(path, task, part, tier)
         start = time.perf_counter()
         with report.progress(f"evaluating {name}") as on_progress:
             errors = evaluate_model(loaded, cases, sizes or task.context_sizes, on_progress)
@@ -482,7 +475,7 @@ def evaluate(
         results = [ContextResult.from_errors(context, e) for context, e in errors.items()]
         keys = tuple(case.keys[0] for case in cases)
         with open_file(path) as file:
-            dataset_hash = content_hash(file, tier, (split,))
+            dataset_hash = content_hash(file, tier, (part,))
             hashes = stored_hashes(file)
         record = ResultRecord(
             track=track,
@@ -597,7 +590,7 @@ def show(task_name: str | None, as_json: bool) -> None:
     if task_name is not None:
         get_task(task_name)
     records = [r for r in read_records() if task_name in (None, r.task)]
-    rows = [
+    rows: list[list[object]] = [
         [
             r.task,
             r.model,
@@ -615,7 +608,7 @@ def show(task_name: str | None, as_json: bool) -> None:
         table(
             "Full-rollout MSE x 1e6",
             ["task", "model", "preset", "seed", "context", "mse", "free nodes"],
-            rows,  # type: ignore[arg-type]
+            rows,
         ),
     )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.file import find_dataset
-from m3gn_bench.datasets.schema import SPLITS, Split
+from m3gn_bench.datasets.schema import SPLITS, Split, parse_key
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.tasks import Task
 
@@ -50,6 +50,5 @@ def _simulate(scene_name: str, key: str) -> Trajectory:
     from m3gn_bench.generators.generate import simulate_one
     from m3gn_bench.generators.scene import get_scene
 
-    split, _, index = key.rpartition("_")
-    trajectory, _ = simulate_one(get_scene(scene_name), split, int(index))  # type: ignore[arg-type]
+    trajectory, _ = simulate_one(get_scene(scene_name), *parse_key(key))
     return trajectory

@@ -1,5 +1,6 @@
 """What is written is read back bit for bit, hashes see every change, splits and tiers are what they promise."""
 
+import os
 import pickle
 import shutil
 from collections import Counter
@@ -181,13 +182,19 @@ def test_dataset_is_lazy_and_picklable(tetra_file: Path) -> None:
     assert_identical(again[0], first)
 
 
+def describe_in_worker(batch: list[Trajectory]) -> tuple[str, bool]:
+    """The hash of a batch of one, and whether the worker that read it did so through a file of its own."""
+    worker = torch.utils.data.get_worker_info()
+    assert worker is not None
+    return batch[0].content_hash(), worker.dataset._handle[0] == os.getpid()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_dataset_works_in_worker_processes(tetra_file: Path) -> None:
     dataset = TrajectoryDataset(tetra_file, TASK, "train")
-    expected = [
-        dataset[i].content_hash() for i in range(len(dataset))
-    ]  # leaves the file open: forks inherit it
-    loader = DataLoader(dataset, batch_size=1, num_workers=2, collate_fn=list)
-    assert [batch[0].content_hash() for batch in loader] == expected
+    hashes = [dataset[i].content_hash() for i in range(len(dataset))]  # the file stays open: forks inherit it
+    loader = DataLoader(dataset, num_workers=2, collate_fn=describe_in_worker, multiprocessing_context="fork")
+    assert list(loader) == [(digest, True) for digest in hashes]
 
 
 def test_dataset_verifies_what_it_returns(tmp_path: Path, tetra_file: Path) -> None:

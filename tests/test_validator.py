@@ -103,6 +103,12 @@ FILE_DEFECTS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "hash of file": ("E009", "/", set_attribute("content_hash", "0" * 64)),
     "trajectory taken out": ("E009", "/", delete(GROUP)),
     "no splits": ("E010", "/splits", delete("splits")),
+    "trajectory in no split": ("E010", "/splits", replace_array(f"{TASK}/test", lambda keys: keys[1:])),
+    "trajectory without proper name": (
+        "E009",
+        "/",
+        edit(lambda file: file["trajectories"].move("test_00003", "last")),
+    ),
     "split lists unknown key": (
         "E010",
         f"{TASK}/test",
@@ -278,3 +284,17 @@ def test_no_damaged_byte_goes_unnoticed(tmp_path: Path, name: str, request: pyte
             unnoticed += 1
             assert everything(path) == expected, position
     assert unnoticed < 20
+
+
+@pytest.mark.parametrize("text", ['"train": 100', "[0.0, 0.0, 0.5]", "µm", "tetra_task", "test_00003"])
+def test_no_damaged_text_goes_unnoticed(tmp_path: Path, tetra_file: Path, text: str) -> None:
+    """Content hashes do not cover metadata and splits, so HDF5's checksums must."""
+    content, wanted = tetra_file.read_bytes(), text.encode()
+    places = [i for i in range(len(content)) if content.startswith(wanted, i)]
+    assert places
+    for place in places:
+        damaged = bytearray(content)
+        damaged[place + len(wanted) - 1] ^= 1
+        path = tmp_path / "damaged.h5"
+        path.write_bytes(damaged)
+        assert not validate(path).ok

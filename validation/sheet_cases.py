@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from m3gn_bench.generators.scene import Fidelity
+from m3gn_bench.datasets.schema import Fidelity
 from m3gn_bench.generators.sheet_deformation import (
     FORCE,
     LOAD_RADIUS,

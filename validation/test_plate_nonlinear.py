@@ -14,7 +14,7 @@ from sheet_cases import (
     worst_frame_error,
 )
 
-from m3gn_bench.generators.scene import Fidelity
+from m3gn_bench.datasets.schema import Fidelity
 from m3gn_bench.generators.sheet_deformation import INCREMENTS, SheetDeformation
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate

@@ -48,9 +48,13 @@ class ClampedPlate:
         ValueError: a parameter outside its physical range.
     """
 
-    def __init__(self, *, ticks: Array, thickness: float, youngs_modulus: float, poisson_ratio: float) -> None:
+    def __init__(
+        self, *, ticks: Array, thickness: float, youngs_modulus: float, poisson_ratio: float
+    ) -> None:
         if min(thickness, youngs_modulus) <= 0:
-            raise ValueError(f"thickness and youngs_modulus must be positive, not {thickness}, {youngs_modulus}")
+            raise ValueError(
+                f"thickness and youngs_modulus must be positive, not {thickness}, {youngs_modulus}"
+            )
         if not -1 < poisson_ratio < 0.5:
             raise ValueError(f"poisson_ratio must lie in (-1, 0.5), not {poisson_ratio}")
         if len(ticks) < 3 or ticks[0] != 0 or np.diff(ticks).min() <= 0:

@@ -53,14 +53,14 @@ class BandedAssembler:
 
     def vector(self, element_vectors: Array) -> Array:
         """Sum element vectors [elements, local_dofs] into the free unknowns [unknowns]."""
-        gathered: Array = np.bincount(self._element_dofs, element_vectors.ravel(), self.dofs)
-        return gathered[self.free]
+        return _gather(self._element_dofs, element_vectors.ravel(), self.dofs)[self.free]
 
     def matrix(self, element_matrices: Array) -> Array:
         """Sum element matrices [elements, local_dofs, local_dofs] into [bandwidth + 1, unknowns]."""
         size = (self.bandwidth + 1) * self.unknowns
-        flat: Array = np.bincount(self._slots, element_matrices.reshape(-1)[self._entries], size)
-        return flat.reshape(self.bandwidth + 1, self.unknowns)
+        return _gather(self._slots, element_matrices.reshape(-1)[self._entries], size).reshape(
+            self.bandwidth + 1, self.unknowns
+        )
 
     def factorise(self, matrix: Array) -> "BandedCholesky":
         """Cholesky factorisation of an assembled matrix.
@@ -87,6 +87,11 @@ class BandedAssembler:
                 shifted = matrix.copy()
                 shifted[0] += 1e-5 * 10**attempt * diagonal
         raise LinAlgError("the stiffness matrix stays indefinite under a diagonal shift")
+
+
+def _gather(slots: NDArray[np.int64], values: Array, size: int) -> Array:
+    """Sum values into slots."""
+    return np.asarray(np.bincount(slots, values, size), dtype=np.float64)
 
 
 def _bandwidth(rows: NDArray[np.int64], columns: NDArray[np.int64], order: NDArray[np.integer]) -> int:
