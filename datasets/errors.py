@@ -4,6 +4,9 @@
 class BenchError(Exception):
     """Something the user can act on. The message says what was wrong, where, and what to do."""
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))  # libraries whose errors are quoted here break lines
+
 
 class DatasetError(BenchError):
     """A dataset file cannot be written, opened or trusted."""

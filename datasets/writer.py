@@ -7,6 +7,7 @@ a file under a name that anybody reads.
 
 import io
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -102,9 +103,11 @@ def merge_shards(
     path.parent.mkdir(parents=True, exist_ok=True)
     stats = os.statvfs(path.parent)
     if stats.f_bavail * stats.f_frsize < needed:
-        raise DatasetError(f"cannot write {path}: {needed >> 20} MiB needed, less is free in {path.parent}")
+        raise DatasetError(
+            f"cannot write {path}: {needed / 1e6:.1f} MB needed, less is free in {path.parent}"
+        )
 
-    with atomic_path(path) as temporary, _hdf5_errors(path), h5py.File(temporary, "w", libver=LIBVER) as file:
+    with atomic_path(path) as temporary, _hdf5_errors(), h5py.File(temporary, "w", libver=LIBVER) as file:
         file.create_group("meshes")
         file.create_group("trajectories")
         for key, shard in shards.items():
@@ -133,9 +136,12 @@ def merge_shards(
 
 
 @contextmanager
-def _hdf5_errors(path: Path) -> Iterator[None]:
-    """HDF5 raises RuntimeError for a failed write-back; make it the OSError that it is."""
+def _hdf5_errors() -> Iterator[None]:
+    """HDF5 reports what the operating system refused in a long text: make it the OSError that it is."""
     try:
         yield
-    except RuntimeError as error:
-        raise OSError(f"HDF5 could not write {path.name} ({error})") from error
+    except (RuntimeError, OSError) as error:
+        code = re.search(r"errno = (\d+)", str(error))
+        if code is None:
+            raise OSError(f"HDF5 failed ({error})") from error
+        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error

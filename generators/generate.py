@@ -139,6 +139,8 @@ def generate(
         raise GeneratorError(unknown_name("fidelity", fidelity, list(scene.fidelities)))
     if workers < 1:
         raise GeneratorError(f"workers must be at least 1, not {workers}")
+    if seed < 0:
+        raise GeneratorError(f"the seed must not be negative, as {seed} is")
     metadata = _metadata(scene, tier, fidelity, seed)
     path = out / dataset_name(scene_name, tier, splits, fidelity, seed)
     shard_folder = out / f".{scene_name}-{fidelity}-seed{seed}.shards"

@@ -55,6 +55,17 @@ def replace_array(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[P
     return edit(swap)
 
 
+def store_otherwise(name: str, **layout: Any) -> Callable[[Path], None]:
+    """An array with the same numbers (if any) in another layout."""
+
+    def swap(file: h5py.File) -> None:
+        array = file[name][()]
+        del file[name]
+        file.create_dataset(name, **({} if "shape" in layout else {"data": array}), **layout)
+
+    return edit(swap)
+
+
 def foreign_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file["trajectories"] = np.arange(3)
@@ -95,6 +106,13 @@ FILE_DEFECTS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "bit flip in compressed bytes": ("E003", GROUP, flip_stored_bit),
     "positions are text": ("E003", "/", replace_array(f"{GROUP}/positions", lambda array: b"text")),
     "splits are no groups": ("E003", "/splits", replace_array(f"{TASK}/test", len)),
+    # One flipped bit can make HDF5 ask for terabytes, so only the writer's own layout is read.
+    "more numbers than memory": (
+        "E003",
+        GROUP,
+        store_otherwise(f"{GROUP}/positions", shape=(10**6, 10**6, 3), dtype="<f4"),
+    ),
+    "other chunks": ("E003", GROUP, store_otherwise(f"{GROUP}/positions", chunks=(1, 5, 3))),
     "positions in float64": ("E004", GROUP, replace_array(f"{GROUP}/positions", np.float64)),
     "wrong number of frames": ("E004", "/trajectories/test_00000", set_attribute("frames", 5)),
     "number changed": ("E009", GROUP, replace_array(f"{GROUP}/positions", lambda array: array + 1)),
