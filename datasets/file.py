@@ -154,14 +154,20 @@ def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str]
     return combine_hashes(chosen)
 
 
-def find_dataset(folder: Path, scene: str, tier: str, splits: Sequence[str]) -> Path | None:
-    """The smallest file in a folder that holds the leaderboard's data of a scene, tier and splits, or None."""
+def find_dataset(
+    folder: Path, scene: str, tier: str, splits: Sequence[str], version: str | None = None
+) -> Path | None:
+    """The smallest file in a folder that holds the leaderboard's data of a scene, tier and splits, or None.
+
+    With `version` only files of that dataset version count.
+    """
     suitable = []
     for path in folder.glob(f"{scene}-*.h5"):
         try:
             with open_file(path) as file:
                 metadata = read_metadata(file)
-                if (metadata.scene, metadata.fidelity, metadata.seed) == (scene, "default", DATASET_SEED):
+                usual = (metadata.scene, metadata.fidelity, metadata.seed) == (scene, "default", DATASET_SEED)
+                if usual and version in (None, metadata.dataset_version):
                     content_hash(file, tier, splits)
                     suitable.append((path.stat().st_size, path))
         except DatasetError:

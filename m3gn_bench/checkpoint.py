@@ -23,6 +23,15 @@ from m3gn_bench.tasks import get_task
 WEIGHTS, DESCRIPTION = "weights.safetensors", "checkpoint.json"
 
 
+class ConfigRecord(Record):
+    """A `RunConfig` as JSON; what the two tables may hold is the model's and the training loop's affair."""
+
+    model_name: str
+    preset: str
+    model: dict[str, Any]
+    training: dict[str, Any]
+
+
 class Checkpoint(Record):
     """What `checkpoint.json` says.
 
@@ -34,7 +43,7 @@ class Checkpoint(Record):
 
     task: str
     seed: int
-    config: dict[str, Any]
+    config: ConfigRecord
     config_hash: str
     steps: int
     best_step: int
@@ -65,7 +74,9 @@ def read_description(folder: Path) -> Checkpoint:
     try:
         return Checkpoint.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise CheckpointError(f"{path} is damaged: {error.errors()[0]['msg']}") from error
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise CheckpointError(f"{path} is damaged: {place}: {first['msg']}") from error
 
 
 def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
@@ -85,7 +96,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
             f"{path} does not match the SHA-256 in {DESCRIPTION}: it is damaged or was replaced"
         )
     try:
-        config = RunConfig.from_json(description.config)
+        config = RunConfig.from_json(description.config.model_dump())
         model = build_model(config, get_task(description.task))
         model.load_state_dict(load(content))
     except (ValidationError, KeyError, RuntimeError, safetensors.SafetensorError) as error:

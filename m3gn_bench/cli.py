@@ -135,7 +135,9 @@ def list_command(as_json: bool) -> None:
 )
 @click.option("--fidelity", default="default", show_default=True, help="fast, default or reference.")
 @click.option("--split", "splits", multiple=True, help="Only this split (may be given several times).")
-@click.option("--seed", type=int, default=None, help="Of the dataset.  [default: the leaderboard's]")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=None, help="Of the dataset.  [default: the leaderboard's]"
+)
 @WORKERS
 @DATA
 @JSON
@@ -259,7 +261,9 @@ def card(file: Path, as_json: bool) -> None:
 @click.option("--task", required=True, help="What to train on.")
 @click.option("--model", required=True, help="Which model.")
 @click.option("--preset", default="compact", show_default=True, help="smoke, compact or paper.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of weights and sampling.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and sampling."
+)
 @click.option("--minutes", type=float, default=None, help="Budget: CPU minutes of training steps.")
 @click.option("--steps", type=int, default=None, help="Budget: optimiser steps.")
 @click.option("--tier", default="paper", show_default=True, help="Which data.")
@@ -267,7 +271,9 @@ def card(file: Path, as_json: bool) -> None:
     "--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the run."
 )
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Override a preset's value.")
-@click.option("--threads", type=int, default=1, show_default=True, help="Of torch, on the CPU.")
+@click.option(
+    "--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of torch, on the CPU."
+)
 @click.option("--device", default="cpu", show_default=True, help="A torch device.")
 @click.option("--tensorboard", is_flag=True, help="Write curves to the run's folder.")
 @WORKERS
@@ -349,8 +355,8 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     for setting in settings:
         key, equals, text = setting.partition("=")
         try:
-            values[key.strip()] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+            (values[key.strip()],) = tomllib.loads(f"value = {text}").values()
+        except (tomllib.TOMLDecodeError, ValueError):
             raise click.BadParameter(
                 f"{setting!r} is no KEY=VALUE with a TOML value, e.g. training.learning_rate=1e-3"
             ) from None
@@ -366,7 +372,9 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
 )
 @click.option("--tier", default="quick", show_default=True, help="Which test trajectories.")
 @click.option("--preset", default="compact", show_default=True, help="Which shipped checkpoint.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Which shipped checkpoint.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which shipped checkpoint."
+)
 @click.option(
     "--checkpoint",
     type=click.Path(path_type=Path, file_okay=False),
@@ -383,7 +391,12 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     default=None,
     help="Also write a result record below this folder (in a checkout: leaderboard).",
 )
-@click.option("--threads", type=int, default=os.cpu_count() or 1, help="Of torch.  [default: all cores]")
+@click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    default=os.cpu_count() or 1,
+    help="Of torch.  [default: all cores]",
+)
 @WORKERS
 @DATA
 @JSON
@@ -435,8 +448,8 @@ def evaluate(
     sizes = None if contexts is None else _parse_contexts(contexts)
     if checkpoint is not None:
         described = read_description(checkpoint)
-        if described.config["model_name"] != model:
-            raise CheckpointError(f"{checkpoint} holds a {described.config['model_name']}, not a {model}")
+        if described.config.model_name != model:
+            raise CheckpointError(f"{checkpoint} holds a {described.config.model_name}, not a {model}")
         if task_name not in (None, described.task):
             raise CheckpointError(f"{checkpoint} was trained on {described.task}, not on {task_name}")
         folders = {described.task: checkpoint}
@@ -481,7 +494,7 @@ def evaluate(
             track=track,
             task=name,
             model=model,
-            preset=described.config["preset"],
+            preset=described.config.preset,
             seed=described.seed,
             parameters=loaded.parameter_count(),
             tier=tier,

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib import resources
 from importlib.metadata import entry_points
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ class ModelConfig(BaseModel):
     """Base of all configurations: an unknown key is an error, and nothing changes after the start."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+C = TypeVar("C", bound=ModelConfig)
 
 
 class TrainingConfig(ModelConfig):
@@ -185,16 +188,21 @@ def load_preset(
             raise ConfigError(unknown_name("configuration key", key, known))
         section, _, name = key.partition(".")
         values[section][name] = value
+    return RunConfig(
+        model_name=model_name,
+        preset=preset,
+        model=_validated(model_class.Config, "model", values["model"]),
+        training=_validated(TrainingConfig, "training", values["training"]),
+    )
+
+
+def _validated(kind: type[C], section: str, values: dict[str, Any]) -> C:
     try:
-        return RunConfig(
-            model_name=model_name,
-            preset=preset,
-            model=model_class.Config.model_validate(values["model"]),
-            training=TrainingConfig.model_validate(values["training"]),
-        )
+        return kind.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigError(f"configuration key {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        key = ".".join(map(str, (section, *first["loc"])))
+        raise ConfigError(f"configuration key {key}: {first['msg']}") from error
 
 
 def build_model(config: RunConfig, task: Task, seed: int = 0) -> Model:

@@ -25,10 +25,12 @@ def find_or_generate(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
     """A dataset file in `folder` that holds the task's tier and splits; generated if there is none."""
-    found = find_dataset(folder, task.scene, tier, splits)
+    from m3gn_bench.generators.generate import generate
+    from m3gn_bench.generators.scene import get_scene
+
+    found = find_dataset(folder, task.scene, tier, splits, get_scene(task.scene).dataset_version)
     if found is not None:
         return found
-    from m3gn_bench.generators.generate import generate
 
     return generate(task.scene, tier, folder, splits=splits, workers=workers, on_progress=on_progress).file
 

@@ -89,12 +89,12 @@ def train(
     torch.set_num_threads(threads)
     if (out / DESCRIPTION).is_file():
         found = read_description(out)
-        if (found.task, found.seed, found.config) != (task.name, seed, config.to_json()):
+        if (found.task, found.seed, found.config.model_dump()) != (task.name, seed, config.to_json()):
             raise CheckpointError(
                 f"{out} holds another finished run ({found.task}, seed {found.seed}); use another folder"
             )
         return found
-    where = torch.device(device)
+    where = _usable(device)
     model = build_model(config, task, seed)
     model.prepare(training_cases)
     model.to(where)
@@ -134,6 +134,14 @@ def train(
     save_checkpoint(out, run.best_weights, run.description())
     (out / STATE).unlink(missing_ok=True)
     return read_description(out)
+
+
+def _usable(device: str) -> torch.device:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch asserts where it was built without the device
+        raise ConfigError(f"device {device!r} cannot be used: {error}") from error
+    return torch.device(device)
 
 
 class _Run:

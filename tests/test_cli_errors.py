@@ -71,7 +71,7 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         (["generate", TASK, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
         (["generate", TASK, "--workers", "0"], ["workers must be at least 1"]),
         (["generate", TASK, "--workers", "two"], ["'two' is not a valid integer"]),
-        (["generate", TASK, "--seed", "-1"], ["seed must not be negative"]),
+        (["generate", TASK, "--seed", "-1"], ["--seed"]),
         ([*TRAIN, "--task", "bending"], ["task 'bending'", "known: sheet_deformation,"]),
         ([*TRAIN, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
         ([*TRAIN, "--preset", "big"], ["preset 'big'", "known: compact, paper, smoke"]),
@@ -234,14 +234,13 @@ def flip_bit(path: Path) -> None:
         ),
         (lambda folder: (folder / "weights.safetensors").unlink(), ["cannot read", "weights.safetensors"]),
         (lambda folder: flip_bit(folder / "weights.safetensors"), ["does not match the SHA-256"]),
-        pytest.param(
+        (
             lambda folder: edit_json(folder / "checkpoint.json", lambda r: r["config"].pop("model_name")),
-            ["model_name"],
-            marks=pytest.mark.xfail(raises=KeyError, strict=True, reason="evaluate trusts the description"),
+            ["config.model_name"],
         ),
         (
             lambda folder: edit_json(folder / "checkpoint.json", lambda r: r["config"].pop("training")),
-            ["does not fit this version"],
+            ["config.training"],
         ),
         (
             lambda folder: edit_json(
@@ -304,7 +303,6 @@ def test_evaluate_refuses(
     assert_one_line(outcome, *parts)
 
 
-@pytest.mark.xfail(strict=True, reason="the command line does not check these before torch and numpy do")
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
