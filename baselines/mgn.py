@@ -24,7 +24,7 @@ class MeshGraphNetConfig(ModelConfig):
 
     width: int = Field(default=128, ge=1)
     message_passing_steps: int = Field(default=15, ge=1)
-    noise: float = Field(default=1e-2, ge=0)  # standard deviation of the position noise, scaled units
+    noise: float = Field(default=1e-2, ge=0)  # standard deviation of the last movement's noise, scaled units
 
 
 class MeshGraphNet(Model):
@@ -71,7 +71,7 @@ class MeshGraphNet(Model):
         nodes = torch.arange(body.nodes, device=frame.device)
         before, now, after = (case.positions[frame + shift, nodes] for shift in (-1, 0, 1))
         earliest = case.positions[(frame - 2).clamp(min=0), nodes]
-        # A random walk: the noise of two movements, summed up to the noise of two positions.
+        # A random walk: independent draws add up to the noise of two movements, and those to positions.
         drawn = rng.standard_normal((2, *now.shape), dtype=np.float32) * (self.config.noise / 2**0.5)
         walk = torch.from_numpy(drawn).to(now.device).cumsum(0).cumsum(0) * ~body.fixed[:, None]
         before, now = before + walk[0], now + walk[1]

@@ -141,10 +141,10 @@ def generate(
         raise GeneratorError(f"workers must be at least 1, not {workers}")
     if seed < 0:
         raise GeneratorError(f"the seed must not be negative, as {seed} is")
+    sizes = tier_sizes(tier, scene.paper_sizes)
     metadata = _metadata(scene, tier, fidelity, seed)
     path = out / dataset_name(scene_name, tier, splits, fidelity, seed)
     shard_folder = out / f".{scene_name}-{fidelity}-seed{seed}.shards"
-    sizes = tier_sizes(tier, scene.paper_sizes)
     wanted: dict[str, tuple[Split, int]] = {
         trajectory_key(split, i): (split, i)
         for split in SPLITS
@@ -155,28 +155,30 @@ def generate(
     with _reserved(shard_folder):
         for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
             left_by_killed_run.unlink()
-        todo = [key for key in wanted if not _is_complete(shards[key], key, metadata)]
-        done = len(wanted) - len(todo)
-        on_progress(done, len(wanted))
-        jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
-        with closing(_run(jobs, workers)) as finished:  # so that an exception here ends the workers, too
-            for _ in finished:
-                done += 1
-                on_progress(done, len(wanted))
-
-        content_hash = merge_shards(path, shards, metadata, scene.tasks_of)
+        todo: list[str] = []
+        if not _is_complete(path, list(wanted), metadata):
+            todo = [key for key in wanted if not _is_complete(shards[key], [key], metadata)]
+            done = len(wanted) - len(todo)
+            on_progress(done, len(wanted))
+            jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
+            with closing(_run(jobs, workers)) as finished:  # so that an exception here ends the workers, too
+                for _ in finished:
+                    done += 1
+                    on_progress(done, len(wanted))
+            merge_shards(path, shards, metadata, scene.tasks_of)
         with open_file(path) as file:
-            rejections = list(read_metadata(file).rejections)
+            made = read_metadata(file)
             seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
         for shard in shards.values():
-            shard.unlink()
+            shard.unlink(missing_ok=True)
         if not any(shard_folder.glob("*.h5")):  # else a run of a larger tier was interrupted, and may go on
             shutil.rmtree(shard_folder)
-    return GenerationReport(path, content_hash, len(wanted), rejections, float(np.mean(seconds)), len(todo))
+    return GenerationReport(
+        path, made.content_hash, len(wanted), list(made.rejections), float(np.mean(seconds)), len(todo)
+    )
 
 
 def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadata:
-    tier_sizes(tier, scene.paper_sizes)  # an unknown tier is refused here, by name
     return Metadata(
         scene=scene.name,
         dataset_version=scene.dataset_version,
@@ -224,14 +226,15 @@ def _reserved(folder: Path) -> Iterator[None]:
         yield
 
 
-def _is_complete(shard: Path, key: str, metadata: Metadata) -> bool:
-    """Whether an earlier run left this trajectory whole and made by the same generator."""
-    if not shard.is_file():
+def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:
+    """Whether a file (a shard, or a whole dataset) of an earlier run of this generator holds these, whole."""
+    if not path.is_file():
         return False
     try:
-        with open_file(shard) as file:
+        with open_file(path) as file:
             found = read_metadata(file)
-            read_trajectory(file, key)
+            for key in keys:
+                read_trajectory(file, key)
     except DatasetError:
         return False
     own = {"tier", "content_hash", "rejections", "machine"}
@@ -276,7 +279,7 @@ def _run(jobs: Iterator[_Job], workers: int) -> Generator[None]:
         for future in pending:
             future.result()
             yield
-        pool.shutdown()
+        pool.shutdown()  # all done: let workers end by themselves, before the pipe tells them to
     except BrokenProcessPool as error:
         raise GeneratorError(
             "a worker process died (out of memory, or killed); run the same command again to go on"

@@ -3,9 +3,10 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import ValidationError, model_validator
 
 from m3gn_bench.checkpoint import Checkpoint
 from m3gn_bench.datasets.errors import BenchError
@@ -38,6 +39,24 @@ class ContextResult(Record):
     per_timestep_mse: tuple[float, ...]
     trajectory_mse: tuple[float, ...]
     trajectory_mse_free_nodes: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _summaries_follow_from_errors(self) -> Self:
+        errors = np.array(self.trajectory_mse)
+        if not np.isfinite([*self.trajectory_mse, *self.trajectory_mse_free_nodes]).all():
+            raise ValueError("errors are not finite")
+        derived = {
+            "mse": (self.mse, errors.mean()),
+            "mse_free_nodes": (self.mse_free_nodes, np.mean(self.trajectory_mse_free_nodes)),
+            "per_timestep_mse": (np.mean(self.per_timestep_mse), errors.mean()),
+            "ci95": (self.ci95, confidence_interval(errors)),
+        }
+        for name, (stated, expected) in derived.items():
+            if not np.allclose(stated, expected, rtol=1e-6, atol=0):
+                raise ValueError(
+                    f"{name} {stated} does not follow from the trajectories' errors ({expected})"
+                )
+        return self
 
     @classmethod
     def from_errors(cls, context: int, errors: TrajectoryErrors) -> "ContextResult":
@@ -74,6 +93,15 @@ class ResultRecord(Record):
     evaluation_seconds: float
     checkpoint: Checkpoint
     results: tuple[ContextResult, ...]
+
+    @model_validator(mode="after")
+    def _one_error_per_trajectory(self) -> Self:
+        lengths = {len(self.keys), len(self.trajectory_hashes)}
+        for result in self.results:
+            lengths |= {len(result.trajectory_mse), len(result.trajectory_mse_free_nodes)}
+        if len(lengths) != 1:
+            raise ValueError(f"keys, hashes and errors differ in number: {sorted(lengths)}")
+        return self
 
     @property
     def name(self) -> str:

@@ -79,4 +79,4 @@ def _row(cells: Iterable[str]) -> str:
 
 
 def _micro(value: float) -> str:
-    return f"{value * 1e6:.3g}" if value < 1e-3 else f"{value * 1e6:.0f}"
+    return f"{value * 1e6:.3g}" if value < 9.995e-4 else f"{value * 1e6:.0f}"

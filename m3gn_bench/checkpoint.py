@@ -5,7 +5,6 @@ weights belong to and carries their SHA-256.
 """
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -102,14 +101,3 @@ def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
     except (ValidationError, KeyError, RuntimeError, safetensors.SafetensorError) as error:
         raise CheckpointError(f"{folder} does not fit this version of its model: {error}") from error
     return model.eval(), description
-
-
-def run_config_record(text: str) -> dict[str, Any]:
-    """Parse the JSON object that a training state carries. Raises CheckpointError if it is none."""
-    try:
-        record = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise CheckpointError(f"the saved training state is damaged: {error}") from error
-    if not isinstance(record, dict):
-        raise CheckpointError("the saved training state is damaged: no JSON object")
-    return record

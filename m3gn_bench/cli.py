@@ -153,8 +153,7 @@ def generate(
     as_json: bool,
 ) -> None:
     """Simulate TASK's dataset. A run that was interrupted goes on where it stopped."""
-    from m3gn_bench.datasets.schema import SPLITS, as_split
-    from m3gn_bench.generators.generate import DATASET_SEED
+    from m3gn_bench.datasets.schema import DATASET_SEED, SPLITS, as_split
     from m3gn_bench.generators.generate import generate as generate_dataset
     from m3gn_bench.tasks import get_task
 
@@ -299,18 +298,21 @@ def train(
     """Train a model and leave a checkpoint. A run that was interrupted goes on where it stopped."""
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file
-    from m3gn_bench.model import get_model_class, load_preset
+    from m3gn_bench.model import build_model, load_preset
     from m3gn_bench.sources import find_or_generate
     from m3gn_bench.tasks import get_task
-    from m3gn_bench.training import Progress, tensorboard_observer
+    from m3gn_bench.training import Progress, require_budget, tensorboard_observer, usable_device
     from m3gn_bench.training import train as train_model
 
     report = Report(as_json)
     spec = get_task(task)
-    get_model_class(model)
     overrides = _parse_settings(settings)
     overrides |= {f"training.{k}": v for k, v in (("minutes", minutes), ("steps", steps)) if v is not None}
     config = load_preset(model, preset, spec, overrides)
+    # Whatever can be refused is refused before data are simulated.
+    require_budget(config, build_model(config, spec).is_learned)
+    usable_device(device)
+    curves = tensorboard_observer(out) if tensorboard else None
     with report.progress(f"simulating {spec.scene}") as on_progress:
         path = find_or_generate(
             spec, tier, data, splits=("train", "validation"), workers=workers, on_progress=on_progress
@@ -318,7 +320,6 @@ def train(
     with open_file(path) as file:
         dataset_hash = content_hash(file, tier, ("train", "validation"))
     training, validation = (load_cases(path, spec, split, tier) for split in ("train", "validation"))
-    curves = tensorboard_observer(out) if tensorboard else None
     with report.progress(f"training {model}") as on_progress:
 
         def observe(progress: Progress) -> None:
@@ -426,7 +427,7 @@ def evaluate(
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file, stored_hashes
     from m3gn_bench.datasets.schema import as_split
-    from m3gn_bench.errors import CheckpointError
+    from m3gn_bench.errors import CheckpointError, ConfigError
     from m3gn_bench.evaluation import evaluate_model
     from m3gn_bench.leaderboard.record import (
         HASH_DIGITS,
@@ -446,6 +447,8 @@ def evaluate(
     get_model_class(model)
     part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
+    if record_home is not None and (part != "test" or sizes is not None):
+        raise ConfigError("--record takes the test split at the task's own context sizes")
     if checkpoint is not None:
         described = read_description(checkpoint)
         if described.config.model_name != model:
@@ -575,8 +578,11 @@ def _parse_contexts(text: str) -> list[int]:
 
 
 def _commit() -> str | None:
-    """The checkout's commit, marked if files differ from it; None outside a checkout."""
-    git = ["git", "-C", str(Path(__file__).parent)]
+    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
+    checkout = Path(__file__).parents[1]
+    if not (checkout / "pyproject.toml").is_file():
+        return None
+    git = ["git", "-C", str(checkout)]
     try:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
         status = subprocess.run(
@@ -693,7 +699,7 @@ def check_command(task_name: str | None, trajectories: int, offset: int | None, 
     lines += [
         f"{len(outcome.compared)} errors of {len(records)} records compared; largest relative difference "
         f"{largest:.1e} (allowed {RELATIVE_TOLERANCE:g}); {identical} on bit-identical trajectories",
-        "every number was re-derived" if outcome.ok else "the leaderboard does NOT hold",
+        "every sampled number was re-derived" if outcome.ok else "the leaderboard does NOT hold",
     ]
     report.finish(outcome.model_dump(mode="json"), "\n".join(lines))
     sys.exit(0 if outcome.ok else 1)

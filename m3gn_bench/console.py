@@ -5,6 +5,7 @@ no terminal, and with --json.
 """
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -38,7 +39,7 @@ class Report:
     def finish(self, record: dict[str, object], *texts: str | Table) -> None:
         """Print the record as JSON, or else the texts and tables."""
         if self.as_json:
-            click.echo(json.dumps(record, indent=2))
+            click.echo(json.dumps(_finite(record), indent=2, allow_nan=False))
             return
         console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=not sys.stdout.isatty())
         for text in texts:
@@ -60,6 +61,17 @@ class Report:
         with Progress(*columns, console=self.errors, disable=not shown, transient=True) as bar:
             task = bar.add_task(description, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _finite(value: object) -> object:
+    """The same with null for NaN and infinity, which JSON does not know."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return value
 
 
 def table(title: str, columns: list[str], rows: list[list[object]]) -> Table:

@@ -177,7 +177,9 @@ def load_preset(
     if model_class.preset_file is not None:
         package = model_class.__module__.rpartition(".")[0]
         text = (resources.files(package) / "presets" / model_class.preset_file).read_text()
-        tables = tomllib.loads(text)[preset]
+        tables = tomllib.loads(text).get(preset)
+        if tables is None:
+            raise ConfigError(f"{model_class.preset_file} of model {model_name} has no preset {preset!r}")
         for layer in (tables, tables.get("task", {}).get(task.name, {})):
             for section in values:
                 values[section] |= layer.get(section, {})

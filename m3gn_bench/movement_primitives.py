@@ -78,7 +78,6 @@ class ProDMP(nn.Module):
 
     def __init__(self, functions: int = 30, alpha: float = 25.0, alpha_x: float = 2.0) -> None:
         super().__init__()
-        self.functions = functions
         self.decay = alpha / 2
         phi, slope = _tabulate(functions, alpha, alpha_x, 1 / TAU_RANGE[0])
         scale = 1 / np.abs(phi).max(0)

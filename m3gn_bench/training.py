@@ -24,7 +24,6 @@ from m3gn_bench.checkpoint import (
     DESCRIPTION,
     Checkpoint,
     read_description,
-    run_config_record,
     save_checkpoint,
 )
 from m3gn_bench.data import Case, join
@@ -87,14 +86,7 @@ def train(
         TrainingError: the loss is no longer finite.
     """
     torch.set_num_threads(threads)
-    if (out / DESCRIPTION).is_file():
-        found = read_description(out)
-        if (found.task, found.seed, found.config.model_dump()) != (task.name, seed, config.to_json()):
-            raise CheckpointError(
-                f"{out} holds another finished run ({found.task}, seed {found.seed}); use another folder"
-            )
-        return found
-    where = _usable(device)
+    where = usable_device(device)
     model = build_model(config, task, seed)
     model.prepare(training_cases)
     model.to(where)
@@ -108,18 +100,25 @@ def train(
         "threads": threads,
         "package_version": __version__,
     }
+    if (out / DESCRIPTION).is_file():
+        found = read_description(out).model_dump()
+        if any(found[name] != value for name, value in describe.items() if name != "package_version"):
+            raise CheckpointError(
+                f"{out} holds another finished run ({found['task']}, seed {found['seed']}, or other data or "
+                "settings); use another folder"
+            )
+        return read_description(out)
     if not model.is_learned:
         checkpoint = Checkpoint(**describe, steps=0, best_step=0, minutes=0.0, validation_error=None)
         save_checkpoint(out, model.state_dict(), checkpoint)
         return read_description(out)
-    if (config.training.minutes is None) == (config.training.steps is None):
-        raise ConfigError("give a budget: either training.minutes or training.steps")
+    require_budget(config, model.is_learned)
 
     run = _Run(config, model, seed, out, describe)
     run.resume()
     cases = [case.to(where) for case in training_cases]
     held_out = [case.to(where) for case in validation_cases[: config.training.validation_trajectories]]
-    clock = time.perf_counter if where.type == "cuda" else time.process_time
+    clock = time.process_time if where.type == "cpu" else time.perf_counter
     saved = time.perf_counter()
     while run.progress.fraction < 1:
         start = clock()
@@ -136,7 +135,14 @@ def train(
     return read_description(out)
 
 
-def _usable(device: str) -> torch.device:
+def require_budget(config: RunConfig, is_learned: bool) -> None:
+    """Raises ConfigError unless a model that learns has exactly one kind of budget."""
+    if is_learned and (config.training.minutes is None) == (config.training.steps is None):
+        raise ConfigError("give a budget: either training.minutes or training.steps")
+
+
+def usable_device(device: str) -> torch.device:
+    """The device. Raises ConfigError if torch cannot use it here."""
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:  # torch asserts where it was built without the device
@@ -249,16 +255,17 @@ class _Run:
             return
         try:
             with safe_open(path, framework="pt") as file:
-                metadata = file.metadata()
+                metadata = file.metadata() or {}
+                parsed = {name: json.loads(metadata[name]) for name in ("identity", "progress", "rng")}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError) as error:
+        except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); delete it to start again") from error
-        if run_config_record(metadata["identity"]) != json.loads(json.dumps(self.identity)):
+        if parsed["identity"] != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
                 f"{path} belongs to a run with other settings; delete it or use another folder"
             )
-        self.progress = Progress(**run_config_record(metadata["progress"]))
-        self.rng.bit_generator.state = run_config_record(metadata["rng"])
+        self.progress = Progress(**parsed["progress"])
+        self.rng.bit_generator.state = parsed["rng"]
 
         def part(prefix: str) -> dict[str, Tensor]:
             start = len(prefix) + 1

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 
 from m3gn_bench import sources
@@ -62,12 +63,33 @@ def test_check_rederives_every_number(use_board: Path) -> None:
 
 
 def test_planted_error_in_a_record_is_found(use_board: Path) -> None:
+    """One percent on everything at one context size: consistent in itself, so only re-deriving finds it."""
     records = read_records(use_board)
     wrong = records[0].model_dump()
-    wrong["results"][1]["trajectory_mse"] = [value * 1.01 for value in wrong["results"][1]["trajectory_mse"]]
+    result = wrong["results"][1]
+    for name in ("mse", "mse_free_nodes"):
+        result[name] *= 1.01
+    for name in ("ci95", "per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
+        result[name] = [1.01 * value for value in result[name]]
     report = run_check([ResultRecord.model_validate(wrong), *records[1:]])
     assert not report.ok
     assert sum(not c.ok for c in report.compared) == 1
+
+
+@pytest.mark.parametrize("name", ["mse", "mse_free_nodes", "ci95", "per_timestep_mse", "trajectory_mse"])
+def test_numbers_that_do_not_follow_from_the_errors_are_refused(board: Path, name: str) -> None:
+    wrong = read_records(board)[0].model_dump()
+    value = wrong["results"][1][name]
+    wrong["results"][1][name] = 1.01 * value if isinstance(value, float) else [1.01 * v for v in value]
+    with pytest.raises(ValidationError, match="does not follow"):
+        ResultRecord.model_validate(wrong)
+
+
+def test_a_record_needs_one_error_per_trajectory(board: Path) -> None:
+    wrong = read_records(board)[0].model_dump()
+    wrong["keys"] = wrong["keys"][:-1]
+    with pytest.raises(ValidationError, match="differ in number"):
+        ResultRecord.model_validate(wrong)
 
 
 def test_planted_error_in_a_generator_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:

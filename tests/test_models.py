@@ -202,7 +202,7 @@ def test_checkpoint_round_trip_is_exact(name: str, tmp_path: Path) -> None:
     model, case = make_model(name), make_case(2)
     save_checkpoint(tmp_path, model.state_dict(), describe(name))
     loaded, description = load_checkpoint(tmp_path)
-    assert description.config["model_name"] == name
+    assert description.config.model_name == name
     assert torch.equal(predict(loaded, case), predict(model, case))
 
 

@@ -76,9 +76,11 @@ class ModifiedNewton:
         energy, force = self._evaluate(x)
         potential, residual = energy - load @ x, force - load
         norm = float(np.linalg.norm(residual))
-        for _ in range(self.max_iterations):
+        for iteration in range(self.max_iterations + 1):
             if norm <= self.tolerance * load_scale:
                 return x
+            if iteration == self.max_iterations:
+                break
             fresh = self._factor is None
             if self._factor is None:
                 self._factor = self._factorise(x)
