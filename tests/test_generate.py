@@ -123,6 +123,18 @@ def test_smoke_is_a_prefix_of_quick(fake: FakeScene, tmp_path: Path) -> None:
     assert left_in(tmp_path) == {"fake-smoke.h5", "fake-quick.h5"}
 
 
+def test_a_complete_file_is_not_made_again(fake: FakeScene, tmp_path: Path) -> None:
+    """Unless it is damaged: then everything in it is."""
+    first = generate(fake.name, "smoke", tmp_path)
+    again = generate(fake.name, "smoke", tmp_path)
+    assert (first.generated, again.generated) == (16, 0)
+    assert (again.content_hash, again.rejected) == (first.content_hash, first.rejected)
+    with h5py.File(first.file, "a") as file:
+        file["trajectories/test_00000/positions"][0, 0, 0] += 1
+    repaired = generate(fake.name, "smoke", tmp_path)
+    assert (repaired.generated, repaired.content_hash) == (16, first.content_hash)
+
+
 def test_whatever_is_not_the_default_is_in_the_name(fake: FakeScene, tmp_path: Path) -> None:
     """Else a data set of another seed would be taken for the leaderboard's."""
     default = generate("fake", "smoke", tmp_path)
