@@ -3,10 +3,9 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import ValidationError, model_validator
 
 from m3gn_bench.checkpoint import Checkpoint
@@ -46,7 +45,7 @@ class ContextResult(Record):
         errors = np.array(self.trajectory_mse)
         if not np.isfinite([*self.trajectory_mse, *self.trajectory_mse_free_nodes]).all():
             raise ValueError("errors are not finite")
-        derived: dict[str, tuple[ArrayLike, ArrayLike]] = {
+        derived: dict[str, tuple[Any, Any]] = {
             "mse": (self.mse, errors.mean()),
             "mse_free_nodes": (self.mse_free_nodes, np.mean(self.trajectory_mse_free_nodes)),
             "per_timestep_mse": (np.mean(self.per_timestep_mse), errors.mean()),
