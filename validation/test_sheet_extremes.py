@@ -6,6 +6,7 @@ from sheet_cases import OPPOSITE, SAME, displacements, relative_error
 
 from m3gn_bench.generators.generate import DATASET_SEED
 from m3gn_bench.generators.sheet_deformation import (
+    FORCE,
     LOAD_MARGIN,
     MIN_PRINCIPAL_STRAIN,
     NODES_PER_SIDE,
@@ -77,6 +78,27 @@ def test_same_parameters_give_the_same_bytes() -> None:
     first, second = scene.simulate(parameters), scene.simulate(parameters)
     assert first.positions.tobytes() == second.positions.tobytes()
     assert first.content_hash() == second.content_hash()
+
+
+# -- where the default mesh stops being enough ------------------------------------------------------------
+
+
+def test_local_buckling_on_a_finer_mesh_is_rejected() -> None:
+    """The softest sheet with forces near its border: smooth on the default mesh, a snap on the finer one.
+
+    The card states this limit; here both halves of the statement hold, and `check` catches the snap.
+    """
+    parameters = SheetParameters(
+        youngs_modulus=10.0, centres=((22.0, 70.0), (110.0, 118.0)), forces=(FORCE, FORCE)
+    )
+    scene = SheetDeformation()
+    assert scene.check(scene.simulate(parameters, "default")) == []
+    problems = scene.check(scene.simulate(parameters, "reference"))
+    assert any("snaps in frame" in problem for problem in problems), problems
+    frame = 46  # the snap comes two increments later
+    coarse, fine = (displacements(parameters, fidelity)[frame] for fidelity in ("default", "reference"))
+    error = relative_error(coarse, fine)
+    assert error < 0.005, f"{error:.2%} before the snap"
 
 
 # -- symmetries of the physics ---------------------------------------------------------------------------
