@@ -585,8 +585,10 @@ def _commit() -> str | None:
     git = ["git", "-C", str(checkout)]
     try:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        # Records and checkpoints are what is being made: they change no number.
+        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/LEADERBOARD.md"]
         status = subprocess.run(
-            [*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True
+            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
         return None
