@@ -60,7 +60,13 @@ class ContextResult(Record):
 
     @classmethod
     def from_errors(cls, context: int, errors: TrajectoryErrors) -> "ContextResult":
-        """Summarise the errors of all trajectories."""
+        """Summarise the errors of all trajectories. Raises BenchError if the predictions diverge."""
+        diverged = np.count_nonzero(~np.isfinite(errors.mse))
+        if diverged:
+            raise BenchError(
+                f"at context {context} the predictions of {diverged} of {len(errors.mse)} trajectories diverge: "
+                "their errors are not finite"
+            )
         return cls(
             context=context,
             mse=float(errors.mse.mean()),

@@ -17,6 +17,7 @@ from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.generators import sheet_deformation
 from m3gn_bench.leaderboard import check, record, render
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
+from m3gn_bench.metrics import TrajectoryErrors
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +84,13 @@ def test_numbers_that_do_not_follow_from_the_errors_are_refused(board: Path, nam
     wrong["results"][1][name] = 1.01 * value if isinstance(value, float) else [1.01 * v for v in value]
     with pytest.raises(ValidationError, match="does not follow"):
         ResultRecord.model_validate(wrong)
+
+
+def test_diverging_predictions_are_named() -> None:
+    """A model that blows up is a finding for its author, not a traceback and not a record."""
+    errors = np.array([1.0, np.nan, np.inf])
+    with pytest.raises(BenchError, match="context 5 the predictions of 2 of 3"):
+        record.ContextResult.from_errors(5, TrajectoryErrors(errors, errors, errors[:, None]))
 
 
 def test_a_record_needs_one_error_per_trajectory(board: Path) -> None:
