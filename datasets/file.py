@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -98,9 +99,16 @@ def load_trajectory(file: h5py.File, key: str) -> tuple[Trajectory, str]:
             material={name: float(value) for name, value in group["material"].attrs.items()},
             loads={name: _array(group["loads"], name) for name in group.get("loads", ())},
             collider_positions=_array(group, "collider_positions") if "collider_positions" in group else None,
+            collider_edges=_array(group, "collider_edges") if "collider_edges" in group else None,
+            tags={name: str(as_text(value)) for name, value in _attributes(group, "tags").items()},
             diagnostics={name: float(value) for name, value in group["diagnostics"].attrs.items()},
         )
         return trajectory, str(as_text(group.attrs["content_hash"]))
+
+
+def _attributes(group: h5py.Group, name: str) -> dict[str, Any]:
+    """Attributes of a group that may be absent."""
+    return dict(group[name].attrs) if name in group else {}
 
 
 def _array(group: h5py.Group, name: str) -> np.ndarray:
@@ -166,8 +174,9 @@ def find_dataset(
         try:
             with open_file(path) as file:
                 metadata = read_metadata(file)
-                usual = (metadata.scene, metadata.fidelity, metadata.seed) == (scene, "default", DATASET_SEED)
-                if usual and version in (None, metadata.dataset_version):
+                usual = (scene, "default", {}, DATASET_SEED)
+                found = (metadata.scene, metadata.fidelity, metadata.variant, metadata.seed)
+                if found == usual and version in (None, metadata.dataset_version):
                     content_hash(file, tier, splits)
                     suitable.append((path.stat().st_size, path))
         except DatasetError:

@@ -8,6 +8,8 @@
         material                        group; attributes are the parameters
         loads/<name>                    arrays, may be absent
         collider_positions              [frames, collider_nodes, dim] float32, may be absent
+        collider_edges                  [edges, 2] int32, may be absent
+        tags                            group; attributes are words, e.g. object = "teddy"; may be absent
         diagnostics                     group; attributes are what the solver reports
     /splits/<task>/<train|validation|test>   keys of the trajectories, in order
 
@@ -68,6 +70,7 @@ class Metadata(Record):
     generator_version: str
     simulator_versions: dict[str, str]
     fidelity: Fidelity
+    variant: dict[str, str] = {}  # how the scene differs from the benchmark's own, e.g. another solver
     seed: int
     dt: float = Field(gt=0, allow_inf_nan=False)
     time_unit: str

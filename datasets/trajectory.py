@@ -50,6 +50,9 @@ class Trajectory:
         material: parameters by name, in the unit that the dataset's metadata states.
         loads: named arrays that describe the load, e.g. nodal forces [N] of shape [nodes, dim].
         collider_positions: shape [frames, collider_nodes, dim], or None where there is no collider.
+        collider_edges: node indices of the collider's own edges, shape [edges, 2], int32, or None where it
+            has none (a grasping point, for example).
+        tags: what else is known in words, e.g. {"object": "teddy"}.
         diagnostics: what the solver reports (iterations, seconds); not part of the content hash, because
             it describes the making, not the trajectory.
     """
@@ -59,6 +62,8 @@ class Trajectory:
     material: dict[str, float]
     loads: dict[str, np.ndarray] = field(default_factory=dict)
     collider_positions: NDArray[np.float32] | None = None
+    collider_edges: NDArray[np.int32] | None = None
+    tags: dict[str, str] = field(default_factory=dict)
     diagnostics: dict[str, float] = field(default_factory=dict)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -68,13 +73,17 @@ class Trajectory:
         arrays |= {f"loads/{name}": np.asarray(value, "<f4") for name, value in self.loads.items()}
         if self.collider_positions is not None:
             arrays["collider_positions"] = np.asarray(self.collider_positions, "<f4")
+        if self.collider_edges is not None:
+            arrays["collider_edges"] = np.asarray(self.collider_edges, "<i4")
         return arrays
 
     def content_hash(self) -> str:
-        """SHA-256 over names, shapes, types and bytes of all arrays, and over the material."""
+        """SHA-256 over names, shapes, types and bytes of all arrays, over the material, and over the tags."""
         digest = hash_arrays(self.arrays())
         material = json.dumps({name: float(value) for name, value in self.material.items()}, sort_keys=True)
         digest.update(material.encode())
+        if self.tags:
+            digest.update(json.dumps(self.tags, sort_keys=True).encode())
         return digest.hexdigest()
 
 

@@ -35,7 +35,16 @@ CODES = {
     "W001": "the file does not hold its whole tier",
     "W002": "the file holds something that the schema does not know",
 }
-TRAJECTORY_GROUP = {"positions", "mesh", "material", "loads", "collider_positions", "diagnostics"}
+TRAJECTORY_GROUP = {
+    "positions",
+    "mesh",
+    "material",
+    "loads",
+    "collider_positions",
+    "collider_edges",
+    "tags",
+    "diagnostics",
+}
 
 
 class Problem(Record):
@@ -132,6 +141,11 @@ def _trajectory_problems(
     if not 0 <= mesh.cells.min() <= mesh.cells.max() < nodes:
         yield problem("E006", f"cells refer to nodes {mesh.cells.min()}..{mesh.cells.max()} of {nodes}")
         return
+    edges, path = trajectory.collider_edges, trajectory.collider_positions
+    if edges is not None and edges.size:
+        ends = 0 if path is None else path.shape[1]
+        if not 0 <= edges.min() <= edges.max() < ends:
+            yield problem("E006", f"collider edges refer to nodes {edges.min()}..{edges.max()} of {ends}")
     smallest = cell_volumes(mesh.rest_positions, mesh.cells, mesh.cell_type).min()
     if not smallest > 0:
         yield problem("E007", f"the smallest cell at rest has volume {smallest:.3g}")
@@ -152,6 +166,8 @@ def _misfits(trajectory: Trajectory, metadata: Metadata) -> Iterator[str]:
     }
     if trajectory.collider_positions is not None:
         expected["collider_positions"] = (trajectory.collider_positions, (frames, None, dimension), "float32")
+    if trajectory.collider_edges is not None:
+        expected["collider_edges"] = (trajectory.collider_edges, (None, 2), "int32")
     for name, (array, shape, dtype) in expected.items():
         fits = len(array.shape) == len(shape) and all(
             e in (None, a) for a, e in zip(array.shape, shape, strict=True)

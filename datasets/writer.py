@@ -70,6 +70,8 @@ def _write_trajectory(file: h5py.File, key: str, trajectory: Trajectory) -> str:
         if not name.startswith("mesh/"):
             _write_array(group, name, array)
     group.create_group("material").attrs.update(trajectory.material)
+    if trajectory.tags:
+        group.create_group("tags").attrs.update({k: fixed_length(v) for k, v in trajectory.tags.items()})
     group.create_group("diagnostics").attrs.update(trajectory.diagnostics)
     digest = trajectory.content_hash()
     group.attrs["content_hash"] = fixed_length(digest)

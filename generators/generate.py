@@ -35,7 +35,7 @@ from m3gn_bench.datasets.schema import (
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
-from m3gn_bench.generators.scene import Scene, get_scene
+from m3gn_bench.generators.scene import Scene
 from m3gn_bench.version import __version__
 
 MAX_ATTEMPTS = 10
@@ -95,9 +95,9 @@ def simulate_one(
     )
 
 
-def dataset_name(scene: str, tier: str, splits: Sequence[str], fidelity: str, seed: int) -> str:
+def dataset_name(scene: Scene, tier: str, splits: Sequence[str], fidelity: str, seed: int) -> str:
     """File name of a dataset: whatever is not the default is part of it."""
-    parts = [scene, tier]
+    parts = [scene.name, tier, *scene.variant.values()]
     if set(splits) != set(SPLITS):
         parts += [split for split in SPLITS if split in splits]
     if fidelity != "default":
@@ -108,7 +108,7 @@ def dataset_name(scene: str, tier: str, splits: Sequence[str], fidelity: str, se
 
 
 def generate(
-    scene_name: str,
+    scene: Scene,
     tier: str,
     out: Path,
     *,
@@ -121,7 +121,7 @@ def generate(
     """Generate a dataset file, or complete one that an earlier run left unfinished.
 
     Args:
-        scene_name: which scene.
+        scene: which scene, with its options; it is sent to the workers as it is.
         tier: "smoke", "quick" or "paper"; smaller tiers are prefixes of larger ones.
         out: folder for the file and, until it is complete, for its shards.
         workers: processes.
@@ -134,7 +134,6 @@ def generate(
         GeneratorError: unknown names, or a trajectory that cannot be made.
         DatasetError: the folder cannot be written.
     """
-    scene = get_scene(scene_name)
     if fidelity not in scene.fidelities:
         raise GeneratorError(unknown_name("fidelity", fidelity, list(scene.fidelities)))
     if workers < 1:
@@ -143,8 +142,8 @@ def generate(
         raise GeneratorError(f"the seed must not be negative, as {seed} is")
     sizes = tier_sizes(tier, scene.paper_sizes)
     metadata = _metadata(scene, tier, fidelity, seed)
-    path = out / dataset_name(scene_name, tier, splits, fidelity, seed)
-    shard_folder = out / f".{scene_name}-{fidelity}-seed{seed}.shards"
+    path = out / dataset_name(scene, tier, splits, fidelity, seed)
+    shard_folder = out / f".{'-'.join([scene.name, *scene.variant.values(), fidelity])}-seed{seed}.shards"
     wanted: dict[str, tuple[Split, int]] = {
         trajectory_key(split, i): (split, i)
         for split in SPLITS
@@ -160,7 +159,7 @@ def generate(
             todo = [key for key in wanted if not _is_complete(shards[key], [key], metadata)]
             done = len(wanted) - len(todo)
             on_progress(done, len(wanted))
-            jobs = ((shards[key], key, *wanted[key], metadata) for key in todo)
+            jobs = ((scene, shards[key], key, *wanted[key], metadata) for key in todo)
             with closing(_run(jobs, workers)) as finished:  # so that an exception here ends the workers, too
                 for _ in finished:
                     done += 1
@@ -187,6 +186,7 @@ def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadat
         generator_version=__version__,
         simulator_versions=scene.simulator_versions(),
         fidelity=fidelity,
+        variant=scene.variant,
         seed=seed,
         dt=scene.dt,
         time_unit=scene.time_unit,
@@ -241,18 +241,12 @@ def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:
     return found.model_dump(exclude=own) == metadata.model_dump(exclude=own)
 
 
-_Job = tuple[Path, str, Split, int, Metadata]
+_Job = tuple[Scene, Path, str, Split, int, Metadata]
 
 
 def _make_shard(job: _Job) -> None:
-    path, key, split, index, metadata = job
-    trajectory, rejected = simulate_one(
-        get_scene(metadata.scene),
-        split,
-        index,
-        seed=metadata.seed,
-        fidelity=metadata.fidelity,
-    )
+    scene, path, key, split, index, metadata = job
+    trajectory, rejected = simulate_one(scene, split, index, seed=metadata.seed, fidelity=metadata.fidelity)
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
 
 

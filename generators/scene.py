@@ -1,5 +1,6 @@
 """What a scene is, and which scenes there are."""
 
+from dataclasses import fields
 from importlib import import_module
 from typing import Any, ClassVar, Protocol
 
@@ -28,6 +29,11 @@ class Scene(Protocol):
     scale_length: ClassVar[float]
     fidelities: ClassVar[dict[str, Any]]
 
+    @property
+    def variant(self) -> dict[str, str]:
+        """Options (fields of the scene) that differ from the benchmark's, in words; {} for the benchmark's."""
+        ...
+
     def sample(self, rng: np.random.Generator, index: int) -> Any:
         """Draw parameters. Factors that a split must cover evenly cycle with `index`."""
         ...
@@ -54,7 +60,13 @@ class Scene(Protocol):
 
 
 # Imported on demand: a scene loads only the simulator that it needs.
-_SCENES = {"sheet_deformation": "m3gn_bench.generators.sheet_deformation:SheetDeformation"}
+_SCENES = {
+    "sheet_deformation": "m3gn_bench.generators.sheet_deformation:SheetDeformation",
+    "deformable_block": "m3gn_bench.generators.deformable_block:DeformableBlock",
+    "tissue_manipulation": "m3gn_bench.generators.tissue_manipulation:TissueManipulation",
+    "falling_teddy": "m3gn_bench.generators.falling:FallingTeddy",
+    "mixed_objects": "m3gn_bench.generators.falling:MixedObjects",
+}
 
 
 def scene_names() -> list[str]:
@@ -62,9 +74,22 @@ def scene_names() -> list[str]:
     return list(_SCENES)
 
 
-def get_scene(name: str) -> Scene:
-    """The scene of that name. Raises GeneratorError listing all scenes if there is none."""
+def get_scene(name: str, **options: Any) -> Scene:
+    """The scene of that name, with options where they differ from the benchmark's.
+
+    Raises:
+        GeneratorError: no such scene (lists all), or it has no such option (lists its own).
+    """
     if name not in _SCENES:
         raise GeneratorError(unknown_name("scene", name, scene_names()))
     module, attribute = _SCENES[name].split(":")
-    return getattr(import_module(module), attribute)()
+    scene = getattr(import_module(module), attribute)
+    known = [field.name for field in fields(scene)]
+    for option in options:
+        if option not in known:
+            raise GeneratorError(
+                unknown_name(f"option of {name}", option, known)
+                if known
+                else f"{name} has no options, so no {option!r} either"
+            )
+    return scene(**options)

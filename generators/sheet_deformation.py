@@ -73,6 +73,7 @@ class SheetDeformation:
     load_units: ClassVar[dict[str, str]] = {"nodal_forces": "N", "centres": "mm", "forces": "N"}
     scale_centre: ClassVar[tuple[float, ...]] = (SIDE / 2, SIDE / 2, 0.0)
     scale_length: ClassVar[float] = SIDE / 2
+    variant: ClassVar[dict[str, str]] = {}
     fidelities: ClassVar[dict[str, SheetFidelity]] = {
         "fast": SheetFidelity(refinement=1, tolerance=1e-3),
         "default": SheetFidelity(refinement=1, tolerance=1e-6),

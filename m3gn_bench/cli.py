@@ -125,7 +125,7 @@ def list_command(as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("task")
+@click.argument("scene_name", metavar="SCENE")
 @click.option("--tier", default="quick", show_default=True, help="smoke, quick or paper.")
 @click.option(
     "--out",
@@ -134,6 +134,13 @@ def list_command(as_json: bool) -> None:
     help="Folder.  [default: as --data]",
 )
 @click.option("--fidelity", default="default", show_default=True, help="fast, default or reference.")
+@click.option("--solver", default=None, help="Falling objects: explicit (default) or newton-vbd.")
+@click.option(
+    "--mesh",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=None,
+    help="Falling objects: drop the object in this file instead (a closed surface, or tetrahedra).",
+)
 @click.option("--split", "splits", multiple=True, help="Only this split (may be given several times).")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=None, help="Of the dataset.  [default: the leaderboard's]"
@@ -142,25 +149,33 @@ def list_command(as_json: bool) -> None:
 @DATA
 @JSON
 def generate(
-    task: str,
+    scene_name: str,
     tier: str,
     out: Path | None,
     fidelity: str,
+    solver: str | None,
+    mesh: Path | None,
     splits: tuple[str, ...],
     seed: int | None,
     workers: int,
     data: Path,
     as_json: bool,
 ) -> None:
-    """Simulate TASK's dataset. A run that was interrupted goes on where it stopped."""
+    """Simulate a SCENE's dataset (or that of a task). An interrupted run goes on where it stopped."""
     from m3gn_bench.datasets.schema import DATASET_SEED, SPLITS, as_split
     from m3gn_bench.generators.generate import generate as generate_dataset
-    from m3gn_bench.tasks import get_task
+    from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.tasks import TASKS
 
     report = Report(as_json)
-    with report.progress(f"simulating {task}") as on_progress:
+    options: dict[str, Any] = {"solver": solver, "mesh": mesh}
+    scene = get_scene(
+        TASKS[scene_name].scene if scene_name in TASKS else scene_name,
+        **{name: value for name, value in options.items() if value is not None},
+    )
+    with report.progress(f"simulating {scene.name}") as on_progress:
         made = generate_dataset(
-            get_task(task).scene,
+            scene,
             tier,
             out or data,
             workers=workers,

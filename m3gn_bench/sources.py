@@ -28,11 +28,12 @@ def find_or_generate(
     from m3gn_bench.generators.generate import generate
     from m3gn_bench.generators.scene import get_scene
 
-    found = find_dataset(folder, task.scene, tier, splits, get_scene(task.scene).dataset_version)
+    scene = get_scene(task.scene)
+    found = find_dataset(folder, task.scene, tier, splits, scene.dataset_version)
     if found is not None:
         return found
 
-    return generate(task.scene, tier, folder, splits=splits, workers=workers, on_progress=on_progress).file
+    return generate(scene, tier, folder, splits=splits, workers=workers, on_progress=on_progress).file
 
 
 def regenerate(task: Task, keys: Sequence[str]) -> tuple[list[Case], list[str]]:

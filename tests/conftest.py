@@ -12,6 +12,7 @@ from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, SPLITS, Metada
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TETRA, Mesh, Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.generate import generate
+from m3gn_bench.generators.scene import get_scene
 
 TETRA_METADATA = Metadata(
     scene="tetra",
@@ -109,4 +110,4 @@ def tetra_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def smoke_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The smoke tier of Sheet Deformation, simulated in this process. Copy it before damaging it."""
-    return generate("sheet_deformation", "smoke", tmp_path_factory.mktemp("data")).file
+    return generate(get_scene("sheet_deformation"), "smoke", tmp_path_factory.mktemp("data")).file

@@ -65,7 +65,8 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["generate", "bending"], ["task 'bending'", "known: sheet_deformation, sheet_deformation_ood"]),
+        (["generate", "bending"], ["scene 'bending'", "known: deformable_block, falling_teddy,"]),
+        (["generate", TASK, "--solver", "explicit"], [f"{TASK} has no options", "'solver'"]),
         (["generate", TASK, "--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
         (["generate", TASK, "--fidelity", "best"], ["fidelity 'best'", "known: default, fast, reference"]),
         (["generate", TASK, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
@@ -88,7 +89,7 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         ([*EVALUATE, "--preset", "big"], ["preset big", "--checkpoint"]),
         (["leaderboard", "show", "--task", "bending"], ["task 'bending'", "known: sheet_deformation,"]),
         (["simulate"], ["No such command 'simulate'"]),
-        (["generate"], ["Missing argument 'TASK'"]),
+        (["generate"], ["Missing argument 'SCENE'"]),
         (["info", "absent.h5"], ["no dataset file at absent.h5"]),
     ],
     ids=lambda value: " ".join(value[-2:]) if isinstance(value, list) else None,

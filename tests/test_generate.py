@@ -22,9 +22,9 @@ from m3gn_bench.datasets.file import content_hash, find_dataset, open_file, read
 from m3gn_bench.datasets.schema import DATASET_SEED, SPLITS
 from m3gn_bench.datasets.trajectory import FREE, VTK_TETRA, Mesh, Trajectory
 from m3gn_bench.datasets.validator import validate
-from m3gn_bench.generators import scene as scenes
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.generate import MAX_ATTEMPTS, draw, generate, simulate_one
+from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
@@ -37,6 +37,7 @@ class FakeScene:
     dataset_version: ClassVar[str] = "1.0"
     tasks: ClassVar[tuple[str, ...]] = ("fake_task",)
     paper_sizes: ClassVar[dict[str, int]] = {"train": 100, "validation": 20, "test": 20}
+    variant: ClassVar[dict[str, str]] = {}
     frames: ClassVar[int] = 3
     dt: ClassVar[float] = 1.0
     time_unit: ClassVar[str] = "s"
@@ -87,8 +88,7 @@ class HopelessScene(FakeScene):
 
 
 @pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeScene:
-    monkeypatch.setitem(scenes._SCENES, "fake", f"{__name__}:FakeScene")
+def fake() -> FakeScene:
     return FakeScene()
 
 
@@ -115,7 +115,7 @@ def test_a_trajectory_alone_is_the_one_in_the_dataset(smoke_file: Path, split: s
 
 
 def test_smoke_is_a_prefix_of_quick(fake: FakeScene, tmp_path: Path) -> None:
-    smoke, quick = (generate("fake", tier, tmp_path) for tier in ("smoke", "quick"))
+    smoke, quick = (generate(fake, tier, tmp_path) for tier in ("smoke", "quick"))
     with open_file(smoke.file) as small, open_file(quick.file) as large:
         assert content_hash(large, "smoke") == content_hash(small) == smoke.content_hash
         assert content_hash(large, "smoke", ["test"]) == content_hash(small, "smoke", ["test"])
@@ -125,22 +125,22 @@ def test_smoke_is_a_prefix_of_quick(fake: FakeScene, tmp_path: Path) -> None:
 
 def test_a_complete_file_is_not_made_again(fake: FakeScene, tmp_path: Path) -> None:
     """Unless it is damaged: then everything in it is."""
-    first = generate(fake.name, "smoke", tmp_path)
-    again = generate(fake.name, "smoke", tmp_path)
+    first = generate(fake, "smoke", tmp_path)
+    again = generate(fake, "smoke", tmp_path)
     assert (first.generated, again.generated) == (16, 0)
     assert (again.content_hash, again.rejected) == (first.content_hash, first.rejected)
     with h5py.File(first.file, "a") as file:
         file["trajectories/test_00000/positions"][0, 0, 0] += 1
-    repaired = generate(fake.name, "smoke", tmp_path)
+    repaired = generate(fake, "smoke", tmp_path)
     assert (repaired.generated, repaired.content_hash) == (16, first.content_hash)
 
 
 def test_whatever_is_not_the_default_is_in_the_name(fake: FakeScene, tmp_path: Path) -> None:
     """Else a data set of another seed would be taken for the leaderboard's."""
-    default = generate("fake", "smoke", tmp_path)
-    seeded = generate("fake", "smoke", tmp_path, seed=7)
-    fast = generate("fake", "smoke", tmp_path, fidelity="fast")
-    part = generate("fake", "smoke", tmp_path, splits=["test", "train"])
+    default = generate(fake, "smoke", tmp_path)
+    seeded = generate(fake, "smoke", tmp_path, seed=7)
+    fast = generate(fake, "smoke", tmp_path, fidelity="fast")
+    part = generate(fake, "smoke", tmp_path, splits=["test", "train"])
     names = [report.file.name for report in (default, seeded, fast, part)]
     assert names == ["fake-smoke.h5", "fake-smoke-seed7.h5", "fake-smoke-fast.h5", "fake-smoke-train-test.h5"]
     assert seeded.content_hash != default.content_hash
@@ -166,7 +166,7 @@ def test_all_draws_differ(fake: FakeScene) -> None:
 
 
 def test_rejected_draws_are_counted_and_redrawn(fake: FakeScene, tmp_path: Path) -> None:
-    report = generate("fake", "smoke", tmp_path / "a")
+    report = generate(fake, "smoke", tmp_path / "a")
     reasons = {(r.key, r.attempt): r.reason for r in report.rejected}
     assert any("diverges" in reason for reason in reasons.values())
     assert any("fails" in reason for reason in reasons.values())
@@ -182,15 +182,14 @@ def test_rejected_draws_are_counted_and_redrawn(fake: FakeScene, tmp_path: Path)
             *(reasons[key, attempt] for attempt in range(attempts)),
             None,
         ]
-    again = generate("fake", "smoke", tmp_path / "b")
+    again = generate(fake, "smoke", tmp_path / "b")
     assert (again.content_hash, again.rejected) == (report.content_hash, report.rejected)
 
 
-def test_hopeless_draws_end_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(scenes._SCENES, "hopeless", f"{__name__}:HopelessScene")
+def test_hopeless_draws_end_the_run(tmp_path: Path) -> None:
     message = rf"train_00000: all {MAX_ATTEMPTS} draws were rejected, the last because diverges at 0\.\d+"
     with pytest.raises(GeneratorError, match=message):
-        generate("hopeless", "smoke", tmp_path)
+        generate(HopelessScene(), "smoke", tmp_path)
     assert list(tmp_path.glob("*.h5")) == []
 
 
@@ -207,9 +206,9 @@ def stop_after(count: int) -> Callable[[int, int], None]:
 
 def test_a_smaller_tier_leaves_an_interrupted_larger_one_alone(fake: FakeScene, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        generate("fake", "quick", tmp_path, on_progress=stop_after(20))
-    assert generate("fake", "smoke", tmp_path).generated == 16 - 8  # the first 20 are of the training split
-    assert generate("fake", "quick", tmp_path).generated == 96 - (20 - 8)
+        generate(fake, "quick", tmp_path, on_progress=stop_after(20))
+    assert generate(fake, "smoke", tmp_path).generated == 16 - 8  # the first 20 are of the training split
+    assert generate(fake, "quick", tmp_path).generated == 96 - (20 - 8)
     assert left_in(tmp_path) == {"fake-smoke.h5", "fake-quick.h5"}
 
 
@@ -217,19 +216,19 @@ def test_shards_of_another_generator_are_made_again(
     fake: FakeScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
-        generate("fake", "smoke", tmp_path, on_progress=stop_after(5))
+        generate(fake, "smoke", tmp_path, on_progress=stop_after(5))
     monkeypatch.setattr(FakeScene, "dataset_version", "1.1")
-    assert generate("fake", "smoke", tmp_path).generated == 16
+    assert generate(fake, "smoke", tmp_path).generated == 16
 
 
 def test_damaged_shards_are_made_again(fake: FakeScene, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        generate("fake", "smoke", tmp_path, on_progress=stop_after(5))
+        generate(fake, "smoke", tmp_path, on_progress=stop_after(5))
     shards = sorted(tmp_path.glob(".*.shards/*.h5"))
     shards[0].write_bytes(shards[0].read_bytes()[:-100])
     with h5py.File(shards[1], "r+") as file:
         file["trajectories/train_00001/positions"][0, 0, 0] = 9
-    assert generate("fake", "smoke", tmp_path).generated == 16 - 3
+    assert generate(fake, "smoke", tmp_path).generated == 16 - 3
 
 
 def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
@@ -238,10 +237,10 @@ def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
     def second(done: int, total: int) -> None:
         if done == 5:
             with pytest.raises(GeneratorError, match="another process") as error:
-                generate("fake", "smoke", tmp_path)
+                generate(fake, "smoke", tmp_path)
             errors.append(error)
 
-    assert generate("fake", "smoke", tmp_path, on_progress=second).generated == 16
+    assert generate(fake, "smoke", tmp_path, on_progress=second).generated == 16
     assert len(errors) == 1
 
 
@@ -347,7 +346,7 @@ def test_worker_that_dies_is_reported(tmp_path: Path) -> None:
             os.kill(worker.pid, signal.SIGKILL)
 
     with pytest.raises(GeneratorError, match=r"a worker process died.*run the same command again"):
-        generate("sheet_deformation", "smoke", tmp_path, workers=2, on_progress=kill_a_worker)
+        generate(get_scene("sheet_deformation"), "smoke", tmp_path, workers=2, on_progress=kill_a_worker)
     assert multiprocessing.active_children() == []
     assert list(tmp_path.glob("*.h5")) == []
 
@@ -388,7 +387,7 @@ def test_merge_asks_for_space_first(fake: FakeScene, tmp_path: Path, monkeypatch
 
     monkeypatch.setattr("os.statvfs", lambda path: Full)
     with pytest.raises(DatasetError, match="less is free"):
-        generate("fake", "smoke", tmp_path)
+        generate(fake, "smoke", tmp_path)
     assert list(tmp_path.glob("*.h5")) == []
     monkeypatch.undo()
 
@@ -396,11 +395,11 @@ def test_merge_asks_for_space_first(fake: FakeScene, tmp_path: Path, monkeypatch
 def test_folder_that_cannot_be_made(fake: FakeScene, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(DatasetError, match=r"cannot write to .*file/data: Not a directory"):
-        generate("fake", "smoke", tmp_path / "file" / "data")
+        generate(fake, "smoke", tmp_path / "file" / "data")
 
 
 @pytest.mark.parametrize("workers", [0, -1])
 def test_number_of_workers_is_checked(fake: FakeScene, tmp_path: Path, workers: int) -> None:
     with pytest.raises(GeneratorError, match="at least 1"):
-        generate("fake", "smoke", tmp_path, workers=workers)
+        generate(fake, "smoke", tmp_path, workers=workers)
     assert left_in(tmp_path) == set()
