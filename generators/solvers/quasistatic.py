@@ -31,7 +31,9 @@ def load_path(newton: ModifiedNewton, load: Array, increments: int) -> Array:
     states = np.zeros((increments + 1, len(load)))
     for k in range(1, increments + 1):
         try:
-            states[k] = newton.minimise(_extrapolate(states[:k]), load * (k / increments), scale)
+            states[k] = newton.minimise(
+                _extrapolate(states[:k]), load=load * (k / increments), force_scale=lambda: scale
+            )
         except SolverError:
             newton.forget()
             try:
@@ -56,7 +58,7 @@ def _bisect(
 ) -> Array:
     """Walk from the equilibrium `start` at load fraction `lower` to `upper`, halving where Newton fails."""
     try:
-        return newton.minimise(start, load * upper, scale)
+        return newton.minimise(start, load=load * upper, force_scale=lambda: scale)
     except SolverError:
         if depth == 0:
             raise

@@ -53,7 +53,11 @@ class BandedAssembler:
 
     def vector(self, element_vectors: Array) -> Array:
         """Sum element vectors [elements, local_dofs] into the free unknowns [unknowns]."""
-        return _gather(self._element_dofs, element_vectors.ravel(), self.dofs)[self.free]
+        return self.full_vector(element_vectors)[self.free]
+
+    def full_vector(self, element_vectors: Array) -> Array:
+        """Sum element vectors [elements, local_dofs] into all degrees of freedom [dofs]."""
+        return _gather(self._element_dofs, element_vectors.ravel(), self.dofs)
 
     def matrix(self, element_matrices: Array) -> Array:
         """Sum element matrices [elements, local_dofs, local_dofs] into [bandwidth + 1, unknowns]."""
