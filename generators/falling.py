@@ -1,0 +1,290 @@
+"""Falling Teddy Bear and Mixed Objects Falling: soft bodies of unknown stiffness dropped on a rigid floor.
+
+A solid of 0.5 m and of random orientation falls from rest, its lowest point 0.5 m above the floor; it hits,
+deforms, rebounds, and comes to rest or rolls. Needed for that are finite-strain elasticity, inertia, gravity,
+the floor with Coulomb friction, and a little viscosity. Young's modulus and Poisson's ratio vary, and in Mixed
+Objects the object. Source: paper, sections 5 and C; the original's step, height, density, size, friction and
+objects are not published, so these are ours.
+"""
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.schema import Fidelity, Split
+from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.objects import SoftBody, load_object, read_object
+from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
+
+SIZE = 0.5  # [m], an object's largest extent in its own axes
+DENSITY = 1000.0  # [kg/m^3]
+VISCOSITY = 100.0  # [Pa s]
+FRICTION = 0.5
+GRAVITY = 9.81  # [m/s^2]
+HEIGHT = 0.5  # [m], of the lowest point above the floor; from 1 m the softest bodies are squashed to a ball
+TRANSITIONS = 200
+FRAME_TIME = 0.01  # [s]
+YOUNGS_MODULI = np.linspace(1e5, 1e6, 1000)  # [Pa]
+POISSON_RATIOS = np.linspace(0.0, 0.499, 100)
+MAX_ENERGY_GROWTH = 1e-2  # within a frame, of the energy at the start
+MAX_SPEED_RATIO = 3.0  # of the speed of a point that falls from the object's highest node
+
+Solver = Literal["explicit", "newton-vbd"]
+
+
+@dataclass(frozen=True)
+class FallParameters:
+    """One draw: which object, its orientation (unit quaternion x, y, z, w), E [Pa], nu and the height [m]."""
+
+    object: str
+    orientation: tuple[float, float, float, float]
+    youngs_modulus: float
+    poisson_ratio: float
+    height: float = HEIGHT
+
+
+@dataclass(frozen=True)
+class FallFidelity:
+    """Discretisation: how often each tetrahedron is split into eight, and the explicit solver's step in
+    units of its limit of stability at rest."""
+
+    refinements: int
+    courant: float
+
+
+@dataclass(frozen=True)
+class _FallingObjects:
+    """What the two scenes share. Positions in m; the floor is z = 0."""
+
+    solver: Solver = "explicit"
+
+    name: ClassVar[str]
+    tasks: ClassVar[tuple[str, ...]]
+    paper_sizes: ClassVar[dict[Split, int]]
+    dataset_version: ClassVar[str] = "1.0"
+    frames: ClassVar[int] = TRANSITIONS + 1
+    dt: ClassVar[float] = FRAME_TIME
+    time_unit: ClassVar[str] = "s"
+    length_unit: ClassVar[str] = "m"
+    material_units: ClassVar[dict[str, str]] = {"youngs_modulus": "Pa", "poisson_ratio": ""}
+    load_units: ClassVar[dict[str, str]] = {"orientation": "quaternion x, y, z, w", "height": "m"}
+    scale_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.5)
+    scale_length: ClassVar[float] = 0.5
+    fidelities: ClassVar[dict[str, FallFidelity]] = {
+        "fast": FallFidelity(refinements=0, courant=0.95),
+        "default": FallFidelity(refinements=0, courant=0.7),
+        "reference": FallFidelity(refinements=1, courant=0.7),
+    }
+
+    def __post_init__(self) -> None:
+        if self.solver not in get_args(Solver):
+            raise GeneratorError(unknown_name("solver", self.solver, list(get_args(Solver))))
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects that fall."""
+        raise NotImplementedError
+
+    @property
+    def variant(self) -> dict[str, str]:
+        """The solver, where it is not the explicit one."""
+        return {} if self.solver == "explicit" else {"solver": self.solver}
+
+    def sample(self, rng: np.random.Generator, index: int) -> FallParameters:
+        """Orientation uniform over all rotations, E and nu from the paper's grids, objects in turn."""
+        orientation = Rotation.random(rng=rng).as_quat()
+        return FallParameters(
+            object=self.objects[index % len(self.objects)],
+            orientation=tuple(orientation.tolist()),
+            youngs_modulus=float(rng.choice(YOUNGS_MODULI)),
+            poisson_ratio=float(rng.choice(POISSON_RATIOS)),
+        )
+
+    def body(self, name: str) -> SoftBody:
+        """The object of that name, its largest extent 1."""
+        return load_object(name)
+
+    def simulate(self, parameters: FallParameters, fidelity: Fidelity = "default") -> Trajectory:
+        """States at 0, 0.01, ..., 2 s.
+
+        Raises:
+            SolverError: positions are not finite.
+        """
+        level = self.fidelities[fidelity]
+        body = self.body(parameters.object)
+        recorded, surface = body.surface_nodes, body.surface
+        for _ in range(level.refinements):
+            body = body.refined()
+        orientation = Rotation.from_quat(parameters.orientation)
+        start = orientation.apply(SIZE * body.vertices)
+        start[:, 2] += parameters.height - start[:, 2].min()
+
+        # Until it touches the floor the body is free of stress, and its motion known.
+        down = np.array([0.0, 0.0, -GRAVITY])
+        times = FRAME_TIME * np.arange(1 + int(np.sqrt(2 * parameters.height / GRAVITY) / FRAME_TIME))
+        flight = start[:recorded] + down / 2 * times[:, None, None] ** 2
+        solid = self._solid(start, body.tetrahedra, parameters)
+        substeps = self._substeps(solid, level)
+        motion = solid.run(
+            start + down / 2 * times[-1] ** 2,
+            np.tile(down * times[-1], (len(start), 1)),
+            frames=TRANSITIONS + 1 - len(times),
+            frame_time=FRAME_TIME,
+            substeps=substeps,
+        )
+        positions = np.concatenate([flight, motion.positions[1:, :recorded]])
+
+        energies, ratios = solid.monitor(motion)
+        total = energies.sum(1)
+        inverted = (ratios <= 0).sum(1)
+        return Trajectory(
+            positions=positions.astype(np.float32),
+            mesh=Mesh(
+                rest_positions=start[:recorded].astype(np.float32),
+                cells=surface.astype(np.int32),
+                cell_type=VTK_TRIANGLE,
+                node_type=np.full(recorded, FREE, dtype=np.uint8),
+            ),
+            material={
+                "youngs_modulus": parameters.youngs_modulus,
+                "poisson_ratio": parameters.poisson_ratio,
+            },
+            loads={
+                "orientation": np.array(parameters.orientation, dtype=np.float32),
+                "height": np.array(parameters.height, dtype=np.float32),
+            },
+            tags={"object": parameters.object},
+            diagnostics={
+                "tetrahedra": solid.cells,
+                "substeps_per_frame": substeps,
+                "min_volume_ratio": float(ratios.min()),
+                "inverted_tetrahedra": int(inverted.max()),
+                "inverted_tetrahedra_at_end": int(inverted[-1]),
+                "self_penetrating_nodes_at_end": _self_penetrating(motion.positions[-1], solid, recorded),
+                "energy_growth": float(np.diff(total).max() / total[0]),
+                "energy_left": float(total[-1] / total[0]),
+                "max_speed": float(np.linalg.norm(motion.velocities, axis=-1).max()),
+            },
+        )
+
+    def check(self, trajectory: Trajectory) -> list[str]:
+        """Finite, above the floor, falling freely at first, no energy from nowhere, nothing left inverted."""
+        positions = trajectory.positions.astype(np.float64)
+        if not np.isfinite(positions).all():
+            frame = int(np.flatnonzero(~np.isfinite(positions).all((1, 2)))[0])
+            return [f"positions are not finite from frame {frame}"]
+        problems = []
+        lowest = positions[:, :, 2].min(1)
+        if lowest.min() < 0:
+            problems.append(f"a node is {-lowest.min():.2g} m below the floor in frame {lowest.argmin()}")
+        found = trajectory.diagnostics
+        if found["energy_growth"] > MAX_ENERGY_GROWTH:
+            problems.append(f"the energy grows by {found['energy_growth']:.2%} within a frame")
+        if found["inverted_tetrahedra_at_end"]:
+            problems.append(f"{found['inverted_tetrahedra_at_end']:.0f} tetrahedra are inverted at the end")
+        if found["max_speed"] > MAX_SPEED_RATIO * np.sqrt(2 * GRAVITY * positions[0, :, 2].max()):
+            problems.append(f"a node moves at {found['max_speed']:.1f} m/s, faster than any fall explains")
+        return problems
+
+    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
+        """One task, of the scene's name."""
+        return list(self.tasks)
+
+    def task_size(self, task: str, split: Split, trajectories: int) -> int:
+        """All of them."""
+        return trajectories
+
+    def simulator_versions(self) -> dict[str, str]:
+        """Versions of the solver's library, scipy and numpy."""
+        libraries = ("warp-lang", "scipy", "numpy")
+        return {
+            name: version(name)
+            for name in (libraries if self.solver == "explicit" else ("newton", *libraries))
+        }
+
+    def _solid(
+        self, start: np.ndarray, tetrahedra: np.ndarray, parameters: FallParameters
+    ) -> "ExplicitSolid":
+        from m3gn_bench.generators.solvers.explicit import ExplicitSolid
+
+        return ExplicitSolid(
+            start,
+            tetrahedra,
+            density=DENSITY,
+            youngs_modulus=parameters.youngs_modulus,
+            poisson_ratio=parameters.poisson_ratio,
+            viscosity=VISCOSITY,
+            friction=FRICTION,
+            gravity=GRAVITY,
+        )
+
+    def _substeps(self, solid, level):
+        return solid.substeps(FRAME_TIME, level.courant)
+
+
+@dataclass(frozen=True)
+class FallingTeddy(_FallingObjects):
+    """One object, the teddy, or the user's own.
+
+    Attributes:
+        mesh: drop this object instead: a file that `read_object` reads. It is read once, here.
+    """
+
+    mesh: Path | SoftBody | None = None
+
+    name: ClassVar[str] = "falling_teddy"
+    tasks: ClassVar[tuple[str, ...]] = ("falling_teddy",)
+    paper_sizes: ClassVar[dict[Split, int]] = {"train": 700, "validation": 150, "test": 150}
+    objects: ClassVar[tuple[str, ...]] = ("teddy",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.mesh, Path):
+            object.__setattr__(self, "mesh", read_object(self.mesh))
+
+    @property
+    def variant(self) -> dict[str, str]:
+        """The solver and the object, where they are not the benchmark's."""
+        own = {} if self.mesh is None else {"mesh": f"{self.mesh.name}-{self.mesh.content_hash()[:8]}"}
+        return super().variant | own
+
+    def body(self, name: str) -> SoftBody:
+        """The teddy, or the user's object."""
+        return super().body(name) if self.mesh is None else self.mesh
+
+
+@dataclass(frozen=True)
+class MixedObjects(_FallingObjects):
+    """Six objects in turn."""
+
+    name: ClassVar[str] = "mixed_objects"
+    tasks: ClassVar[tuple[str, ...]] = ("mixed_objects",)
+    paper_sizes: ClassVar[dict[Split, int]] = {"train": 1800, "validation": 360, "test": 360}
+    objects: ClassVar[tuple[str, ...]] = (
+        "teddy",
+        "bunny",
+        "gummy_bear",
+        "gummy_worm_1",
+        "gummy_worm_2",
+        "traffic_cone",
+    )
+
+
+def _self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: int) -> int:
+    """How many of the recorded nodes lie inside a tetrahedron that is not their own."""
+    corners = positions[solid.tetrahedra]
+    edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    offsets = positions[None, :recorded] - corners[:, :1]  # cell, node, axis
+    weights = np.linalg.solve(edges, offsets.transpose(0, 2, 1))  # cell, axis, node
+    inside = (weights > 0).all(1) & (weights.sum(1) < 1)
+    for corner in range(4):
+        own = solid.tetrahedra[:, corner]
+        mine = np.flatnonzero(own < recorded)
+        inside[mine, own[mine]] = False
+    return int(inside.any(0).sum())

@@ -1,0 +1,189 @@
+"""The explicit solver against closed forms, conservation laws and its own energy."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from skfem import MeshTet
+
+from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.solvers.explicit import ExplicitSolid
+from m3gn_bench.generators.solvers.tetrahedra import lame_constants
+
+MATERIAL = {"density": 1000.0, "youngs_modulus": 2e5, "poisson_ratio": 0.4}
+
+
+def block(cells: int = 2, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """A cube of tetrahedra with positive volumes; its lower corner is the origin."""
+    mesh = MeshTet.init_tensor(*[np.linspace(0, size, cells + 1)] * 3)
+    vertices, tetrahedra = mesh.p.T.copy(), mesh.t.T.astype(np.int32)
+    corners = vertices[tetrahedra]
+    inverted = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
+    return vertices, tetrahedra
+
+
+def solid(**options: Any) -> ExplicitSolid:
+    """A cube of soft material."""
+    return ExplicitSolid(*block(options.pop("cells", 2)), **{**MATERIAL, **options})
+
+
+def deformed(vertices: np.ndarray, amount: float = 0.1) -> np.ndarray:
+    """A smooth finite deformation without symmetry."""
+    x, y, z = vertices.T / 0.3
+    bend = np.stack([np.sin(2 * y + z), x * z, np.cos(x) * y], axis=1)
+    return vertices + 0.3 * amount * bend
+
+
+@pytest.mark.parametrize("nodal_pressure", [True, False])
+def test_force_is_the_energys_gradient(nodal_pressure: bool) -> None:
+    body = solid(nodal_pressure=nodal_pressure, gravity=0.0)
+    x = deformed(body.vertices)
+    force = body.accelerations(x, np.zeros_like(x)) * body.masses[:, None]
+    h = 1e-6
+    for node, axis in [(0, 0), (5, 1), (13, 2), (20, 0)]:
+        shifted = [x.copy(), x.copy()]
+        shifted[0][node, axis] += h
+        shifted[1][node, axis] -= h
+        slope = (body.elastic_energy(shifted[0]) - body.elastic_energy(shifted[1])) / (2 * h)
+        assert force[node, axis] == pytest.approx(-slope, rel=1e-6, abs=1e-6 * np.abs(force).max())
+
+
+def test_lame_constants_are_those_of_small_strain() -> None:
+    """Uniaxial strain needs lambda + 2 mu, shear needs mu."""
+    body = solid(gravity=0.0, nodal_pressure=False)
+    mu, lam = lame_constants(MATERIAL["youngs_modulus"], MATERIAL["poisson_ratio"])
+    strain = 1e-5
+    volume = body.volumes.sum()
+    stretched = body.vertices * (1 + strain, 1, 1)
+    assert body.elastic_energy(stretched) == pytest.approx((lam / 2 + mu) * strain**2 * volume, rel=1e-4)
+    sheared = body.vertices.copy()
+    sheared[:, 0] += strain * sheared[:, 1]
+    assert body.elastic_energy(sheared) == pytest.approx(mu / 2 * strain**2 * volume, rel=1e-4)
+
+
+def test_rigid_motion_costs_nothing() -> None:
+    """Elasticity and viscosity are objective: a spinning body feels no force."""
+    body = solid(gravity=0.0, viscosity=100.0)
+    turned = Rotation.from_rotvec([0.4, -1.0, 2.0]).apply(body.vertices)
+    spin = np.cross([3.0, -2.0, 5.0], turned)
+    largest = np.abs(body.accelerations(turned, spin)).max()
+    assert largest < 1e-9 * np.abs(body.accelerations(deformed(turned), spin)).max()
+
+
+def test_viscosity_dissipates_and_keeps_momentum() -> None:
+    body = solid(gravity=0.0, viscosity=100.0)
+    v = deformed(body.vertices, 1.0)
+    rest, damped = (body.accelerations(body.vertices, w) for w in (np.zeros_like(v), v))
+    power = (body.masses[:, None] * (damped - rest) * v).sum()
+    assert power < 0
+    total = (body.masses[:, None] * damped).sum(0)
+    assert np.abs(total).max() < 1e-12 * np.abs(body.masses[:, None] * damped).max() * body.nodes
+
+
+def test_free_fall_is_exact() -> None:
+    body = solid(viscosity=100.0)
+    start = Rotation.from_rotvec([1.0, 0.2, -0.5]).apply(body.vertices) + [0, 0, 6.0]
+    motion = body.run(start, np.zeros_like(start), frames=100, frame_time=0.01, substeps=20)
+    times = 0.01 * np.arange(101)
+    expected = start + np.array([0, 0, -9.81 / 2]) * times[:, None, None] ** 2
+    assert np.abs(motion.positions - expected).max() < 1e-9
+
+
+def test_energy_and_momentum_over_a_second() -> None:
+    """Without viscosity and contact leapfrog keeps momentum and angular momentum, and almost the energy."""
+    body = solid(gravity=0.0, floor=False)
+    start = deformed(body.vertices, 0.05)
+    velocity = np.cross([0.5, 1.0, -2.0], start) + [1.0, 0.0, 0.3]
+    substeps = body.substeps(0.01, 0.2)
+    motion = body.run(start, velocity, frames=100, frame_time=0.01, substeps=substeps)
+    energies, _ = body.monitor(motion)
+    total = energies.sum(1)
+    assert np.abs(total / total[0] - 1).max() < 1e-3
+    exchanged = np.ptp(energies[:, 1]) / total[0]
+    assert exchanged > 0.02  # so that there was something to keep
+    momentum = (body.masses[:, None] * motion.velocities).sum(1)
+    assert np.abs(momentum - momentum[0]).max() < 1e-5 * np.abs(momentum[0]).max()
+    middle = motion.positions - motion.velocities * motion.lag
+    spin = np.cross(middle, body.masses[:, None] * motion.velocities).sum(1)
+    assert np.abs(spin - spin[0]).max() < 1e-3 * np.abs(spin[0]).max()
+
+
+def test_the_floor_is_never_passed_and_energy_never_grows() -> None:
+    body = solid(viscosity=100.0, friction=0.5)
+    start = Rotation.from_rotvec([1.0, 0.2, -0.5]).apply(body.vertices)
+    start[:, 2] -= start[:, 2].min()
+    velocity = np.tile([2.0, 0.0, -3.0], (body.nodes, 1))
+    motion = body.run(start, velocity, frames=60, frame_time=0.01, substeps=body.substeps(0.01, 0.7))
+    assert motion.positions[..., 2].min() == 0.0
+    energies, _ = body.monitor(motion)
+    total = energies.sum(1)
+    assert np.diff(total).max() < 1e-3 * total[0]
+    assert total[-1] < 0.9 * total[0]
+
+
+def test_sliding_stops_after_coulombs_distance() -> None:
+    """A stiff block slides v^2 / (2 mu g) and then stays."""
+    body = solid(youngs_modulus=2e6, viscosity=2000.0, friction=0.3)
+    velocity = np.tile([1.0, 0.0, 0.0], (body.nodes, 1))
+    motion = body.run(body.vertices, velocity, frames=60, frame_time=0.01, substeps=body.substeps(0.01, 0.7))
+    travelled = (motion.positions[:, :, 0] - body.vertices[:, 0]) @ body.masses / body.masses.sum()
+    assert travelled[-1] == pytest.approx(1 / (2 * 0.3 * 9.81), rel=0.02)
+    assert np.ptp(travelled[-10:]) < 1e-4
+
+
+def test_the_same_run_is_the_same_bit_for_bit() -> None:
+    body = solid(viscosity=100.0, friction=0.5)
+    again = solid(viscosity=100.0, friction=0.5)
+    velocity = np.tile([0.3, 0.0, -3.0], (body.nodes, 1))
+    runs = [
+        b.run(b.vertices, velocity, frames=20, frame_time=0.01, substeps=40).positions
+        for b in (body, again, body)
+    ]
+    assert all(np.array_equal(runs[0], run) for run in runs[1:])
+
+
+@pytest.mark.parametrize("nodal_pressure", [True, False])
+@pytest.mark.parametrize("poisson_ratio", [0.0, 0.499])
+def test_highest_frequency(nodal_pressure: bool, poisson_ratio: float) -> None:
+    """Against the eigenvalues of the dense stiffness matrix, from differences of the force."""
+    body = solid(cells=1, poisson_ratio=poisson_ratio, nodal_pressure=nodal_pressure, gravity=0.0)
+    columns = []
+    h = 1e-7
+    for entry in range(3 * body.nodes):
+        step = np.zeros(3 * body.nodes)
+        step[entry] = h
+        displaced = body.vertices + step.reshape(-1, 3)
+        columns.append(-body.accelerations(displaced, np.zeros_like(displaced)).ravel() / h)
+    largest = np.linalg.eigvals(np.array(columns).T).real.max()
+    assert body.highest_frequency == pytest.approx(np.sqrt(largest), rel=2e-3)
+
+
+def test_beyond_the_stable_step_the_frame_is_named() -> None:
+    body = solid(youngs_modulus=1e9, viscosity=0.0)
+    velocity = np.tile([0.3, 0.0, -3.0], (body.nodes, 1))
+    with pytest.raises(SolverError, match=r"frame \d+: positions are not finite; 20 substeps"):
+        body.run(body.vertices, velocity, frames=50, frame_time=0.01, substeps=20)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"poisson_ratio": 0.5}, "poisson_ratio"),
+        ({"youngs_modulus": 0.0}, "youngs_modulus"),
+        ({"density": 0.0}, "density"),
+        ({"viscosity": -1.0}, "viscosity"),
+        ({"friction": -0.1}, "friction"),
+    ],
+)
+def test_parameters_out_of_range(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        solid(**change)
+
+
+def test_inverted_tetrahedra_are_refused() -> None:
+    vertices, tetrahedra = block()
+    tetrahedra[7] = tetrahedra[7][[1, 0, 2, 3]]
+    with pytest.raises(ValueError, match="tetrahedron 7"):
+        ExplicitSolid(vertices, tetrahedra, **MATERIAL)
