@@ -84,7 +84,7 @@ def test_viscosity_dissipates_and_keeps_momentum() -> None:
 
 def test_free_fall_is_exact() -> None:
     body = solid(viscosity=100.0)
-    start = Rotation.from_rotvec([1.0, 0.2, -0.5]).apply(body.vertices) + [0, 0, 6.0]
+    start = Rotation.from_rotvec([1.0, 0.2, -0.5]).apply(body.vertices) + np.array([0, 0, 6.0])
     motion = body.run(start, np.zeros_like(start), frames=100, frame_time=0.01, substeps=20)
     times = 0.01 * np.arange(101)
     expected = start + np.array([0, 0, -9.81 / 2]) * times[:, None, None] ** 2
@@ -95,7 +95,7 @@ def test_energy_and_momentum_over_a_second() -> None:
     """Without viscosity and contact leapfrog keeps momentum and angular momentum, and almost the energy."""
     body = solid(gravity=0.0, floor=False)
     start = deformed(body.vertices, 0.05)
-    velocity = np.cross([0.5, 1.0, -2.0], start) + [1.0, 0.0, 0.3]
+    velocity = np.cross([0.5, 1.0, -2.0], start) + np.array([1.0, 0.0, 0.3])
     substeps = body.substeps(0.01, 0.2)
     motion = body.run(start, velocity, frames=100, frame_time=0.01, substeps=substeps)
     energies, _ = body.monitor(motion)

@@ -1,0 +1,117 @@
+"""The explicit solver of the falling scenes against scikit-fem, and what its nodal pressure is worth."""
+
+import numpy as np
+import pytest
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import spsolve
+from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, LinearForm, MeshTet
+from skfem.helpers import ddot, div, sym_grad
+
+from m3gn_bench.generators.solvers.explicit import ExplicitSolid
+from m3gn_bench.generators.solvers.tetrahedra import lame_constants
+
+LENGTH, HEIGHT = 1.0, 0.25  # of the beam [m]
+DENSITY, YOUNGS_MODULUS = 1000.0, 1e6
+
+
+def beam(cells: int) -> MeshTet:
+    """A beam along x, `cells` across its height, positively oriented."""
+    across = np.linspace(0, HEIGHT, cells + 1)
+    mesh = MeshTet.init_tensor(np.linspace(0, LENGTH, 4 * cells + 1), across, across)
+    tetrahedra = mesh.t.copy()
+    corners = mesh.p[:, tetrahedra]
+    inverted = np.linalg.det((corners[:, 1:] - corners[:, :1]).transpose(2, 1, 0)) < 0
+    tetrahedra[1:3, inverted] = tetrahedra[2:0:-1, inverted]
+    return MeshTet(mesh.p, tetrahedra)
+
+
+def scikit_fem_sag(
+    mesh: MeshTet, poisson_ratio: float, gravity: float, element: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Static linear deflection under gravity, by scikit-fem: of all nodes [m], and of the tip's mean (z).
+
+    `element` is "plain" or "nodal" (linear tetrahedra) or "quadratic". The body force is lumped for the linear
+    ones, as in the explicit solver.
+    """
+    mu, lam = lame_constants(YOUNGS_MODULUS, poisson_ratio)
+    scalar = ElementTetP2() if element == "quadratic" else ElementTetP1()
+    basis = Basis(mesh, ElementVector(scalar), intorder=4 if element == "quadratic" else 2)
+    shear = BilinearForm(lambda u, v, w: 2 * mu * ddot(sym_grad(u), sym_grad(v))).assemble(basis)
+    if element == "nodal":
+        pressure = basis.with_element(ElementTetP1())
+        coupling = BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, pressure)
+        weights = LinearForm(lambda q, w: q).assemble(pressure)
+        bulk = coupling.T @ diags_array(lam / weights) @ coupling
+    else:
+        bulk = BilinearForm(lambda u, v, w: lam * div(u) * div(v)).assemble(basis)
+    load = LinearForm(lambda v, w: -DENSITY * gravity * v[2]).assemble(basis)
+    free = basis.complement_dofs(basis.get_dofs(lambda x: x[0] < 1e-9))
+    u = np.zeros(basis.N)
+    u[free] = spsolve((shear + bulk)[free][:, free].tocsc(), load[free])
+    nodal = u[basis.nodal_dofs].T
+    return nodal, nodal[mesh.p[0] > LENGTH - 1e-9, 2].mean()
+
+
+def settled(mesh: MeshTet, poisson_ratio: float, gravity: float, nodal_pressure: bool) -> np.ndarray:
+    """The same by the explicit solver: moved until it rests, its velocity dropped whenever the body slows."""
+    solid = ExplicitSolid(
+        mesh.p.T,
+        mesh.t.T,
+        density=DENSITY,
+        youngs_modulus=YOUNGS_MODULUS,
+        poisson_ratio=poisson_ratio,
+        viscosity=300.0,
+        gravity=gravity,
+        floor=False,
+        nodal_pressure=nodal_pressure,
+        fixed=np.flatnonzero(mesh.p[0] < 1e-9),
+    )
+    substeps = solid.substeps(0.01, 0.8)
+    x, v = solid.vertices, np.zeros_like(solid.vertices)
+    before = 0.0
+    for _ in range(400):
+        motion = solid.run(x, v, frames=1, frame_time=0.01, substeps=substeps)
+        x, v = motion.positions[-1], motion.velocities[-1]
+        kinetic = float(solid.masses @ (v**2).sum(1))
+        unbalanced = solid.accelerations(x, np.zeros_like(v))[mesh.p[0] > 1e-9]
+        if np.abs(unbalanced).max() < 1e-4 * gravity:
+            return x - solid.vertices
+        if kinetic < before:
+            v, kinetic = np.zeros_like(v), 0.0
+        before = kinetic
+    raise AssertionError("the beam does not come to rest")
+
+
+@pytest.mark.parametrize("nodal_pressure", [True, False])
+@pytest.mark.parametrize("poisson_ratio", [0.0, 0.3, 0.49])
+def test_static_cantilever_equals_scikit_fem(poisson_ratio: float, nodal_pressure: bool) -> None:
+    """The same linear tetrahedra, assembled by scikit-fem: deflections equal to 0.1 %."""
+    mesh, gravity = beam(2), 1e-3  # so little that the deflection is in the linear range
+    expected, tip = scikit_fem_sag(mesh, poisson_ratio, gravity, "nodal" if nodal_pressure else "plain")
+    found = settled(mesh, poisson_ratio, gravity, nodal_pressure)
+    assert abs(tip) < 1e-4 * LENGTH
+    error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+    print(f"nu {poisson_ratio}, nodal pressure {nodal_pressure}: relative difference {error:.1e}")
+    assert error < 1e-3
+
+
+def test_nodal_pressure_does_not_lock() -> None:
+    """Bending: at nu = 0.499 plain linear tetrahedra lock; with nodal pressure they are as at nu = 0, which is
+    stiff on so coarse a mesh, and converge likewise.
+
+    Reference: quadratic tetrahedra on twice as fine a mesh.
+    """
+    errors: dict[tuple[str, float, int], float] = {}
+    for poisson_ratio in (0.0, 0.499):
+        _, reference = scikit_fem_sag(beam(4), poisson_ratio, 1.0, "quadratic")
+        for cells in (2, 4):
+            for element in ("plain", "nodal"):
+                _, tip = scikit_fem_sag(beam(cells), poisson_ratio, 1.0, element)
+                errors[element, poisson_ratio, cells] = 1 - tip / reference
+    print({key: f"{error:.1%}" for key, error in errors.items()})
+    for cells in (2, 4):
+        unlocked = errors["plain", 0.0, cells]
+        assert errors["nodal", 0.0, cells] == pytest.approx(unlocked, abs=1e-9)  # lambda is zero
+        assert abs(errors["nodal", 0.499, cells] - unlocked) < 0.1
+        assert errors["plain", 0.499, cells] - unlocked > 0.4
+    assert errors["nodal", 0.499, 4] < 0.5 * errors["nodal", 0.499, 2]
