@@ -1,0 +1,130 @@
+"""From a closed surface to tetrahedra: even clusters of its area (pyacvd), then fTetWild (pytetwild).
+
+Both libraries are optional and imported where they are used. Clustering is deterministic, fTetWild is not, not
+even on one thread: the same surface gives another mesh of the same quality each time. So a mesh is made once,
+chosen among several, and kept as data. Sources: Valette, Chassery and Prost, "Generic remeshing of 3D
+triangular meshes with metric-dependent discrete Voronoi diagrams", 2008; Hu et al., "Fast tetrahedral meshing
+in the wild", 2020.
+"""
+
+import itertools
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from m3gn_bench.generators.meshes.geometry import (
+    Floats,
+    Indices,
+    boundary_triangles,
+    cell_volumes,
+    component_count,
+    edge_uses,
+    enclosed_volume,
+    euler_characteristic,
+    is_closed,
+    normalised,
+    stable_time_step,
+    surface_nodes_first,
+)
+
+POINTS_PER_CLUSTER = 30  # of the surface that is clustered; below, the clusters are ragged
+VOLUME_TOLERANCE = 0.15  # relative; flat triangles inside curved surfaces lose 2 % to 8 %
+STOP_ENERGY = 8.0  # of fTetWild: mean shape energy of the cells at which it stops improving
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a mesh is made: number of surface nodes to aim at, edge length of the tetrahedra over the mean edge
+    of that surface, and fTetWild's envelope over the diagonal of the bounding box."""
+
+    surface_nodes: int
+    edge_factor: float
+    envelope: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A mesh whose surface nodes come first, centred, of largest extent 1, and its stable step [s] at
+    E = 1 MPa, nu = 0.3, 1000 kg/m^3 and a size of 0.5 m."""
+
+    recipe: Recipe
+    vertices: Floats
+    tetrahedra: Indices
+    surface_nodes: int
+    stable_step: float
+
+
+def recipes(
+    surface_nodes: Iterable[int], edge_factors: Iterable[float], envelopes: Iterable[float]
+) -> list[Recipe]:
+    """All combinations."""
+    return [Recipe(*values) for values in itertools.product(surface_nodes, edge_factors, envelopes)]
+
+
+def reference_step(vertices: Floats, tetrahedra: Indices) -> float:
+    """Stable step [s] of an object of size 1 scaled to 0.5 m, E = 1 MPa, nu = 0.3, 1000 kg/m^3."""
+    return stable_time_step(0.5 * vertices, tetrahedra, youngs_modulus=1e6, poisson_ratio=0.3, density=1000.0)
+
+
+def cluster_surface(vertices: Floats, triangles: Indices, nodes: int) -> tuple[Floats, Indices]:
+    """A closed surface with evenly spread nodes, about as many as asked."""
+    import pyvista
+    from pyacvd import Clustering
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pyacvd calls what pyvista has deprecated
+        clustering = Clustering(pyvista.PolyData.from_regular_faces(vertices, triangles))
+        while clustering.mesh.n_points < POINTS_PER_CLUSTER * nodes:
+            clustering.subdivide(1)
+        clustering.cluster(nodes)
+        surface = clustering.create_mesh()
+    return np.asarray(surface.points, np.float64), np.asarray(surface.regular_faces, np.int32)
+
+
+def tetrahedralise(
+    vertices: Floats, triangles: Indices, *, edge_length: float, envelope: float
+) -> tuple[Floats, Indices]:
+    """The inside of a closed surface as tetrahedra of positive volume. Another mesh at every call."""
+    from pytetwild import tetrahedralize
+
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    nodes, cells = tetrahedralize(
+        vertices,
+        triangles,
+        edge_length_fac=edge_length / diagonal,
+        epsilon=envelope,
+        stop_energy=STOP_ENERGY,
+        num_threads=1,
+    )
+    nodes, cells = np.asarray(nodes, np.float64), np.asarray(cells, np.int32)
+    inverted = cell_volumes(nodes, cells) < 0  # fTetWild counts the corners the other way round
+    cells[inverted] = cells[inverted][:, [0, 2, 1, 3]]
+    return nodes, cells
+
+
+def candidates(vertices: Floats, triangles: Indices, sweep: Iterable[Recipe]) -> Iterator[Candidate]:
+    """One mesh per recipe, without those that differ from the surface in topology or, by more than 15 %, in
+    volume. The surface is closed, connected and faces outwards."""
+    euler, volume = euler_characteristic(triangles), enclosed_volume(vertices, triangles)
+    for recipe in sweep:
+        coarse, facets = cluster_surface(vertices, triangles, recipe.surface_nodes)
+        edges, _ = edge_uses(facets)
+        mean_edge = np.linalg.norm(coarse[edges[:, 0]] - coarse[edges[:, 1]], axis=1).mean()
+        nodes, cells = tetrahedralise(
+            coarse, facets, edge_length=recipe.edge_factor * mean_edge, envelope=recipe.envelope
+        )
+        volumes = cell_volumes(nodes, cells)
+        if not len(cells) or volumes.min() <= 0:
+            continue
+        surface = boundary_triangles(cells)
+        if (
+            is_closed(surface)
+            and component_count(cells) == 1
+            and euler_characteristic(surface) == euler
+            and abs(volumes.sum() / volume - 1) < VOLUME_TOLERANCE
+        ):
+            nodes, cells, surface_nodes = surface_nodes_first(nodes, cells)
+            nodes = normalised(nodes, cells)
+            yield Candidate(recipe, nodes, cells, surface_nodes, reference_step(nodes, cells))

@@ -1,0 +1,352 @@
+"""The soft bodies that fall: six of our own, kept as data, and whatever mesh a user brings.
+
+Tetrahedral meshing is not deterministic, so no dataset may depend on doing it again: our own meshes are data
+with their hashes (folder `meshes`), and a user's surface is meshed once, in the process that reads it. The
+scene holds the body, and worker processes get it with the scene, node for node.
+"""
+
+import json
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from m3gn_bench.datasets.trajectory import hash_arrays
+from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.meshes.geometry import (
+    Floats,
+    Indices,
+    boundary_triangles,
+    cell_volumes,
+    component_count,
+    enclosed_volume,
+    is_closed,
+    is_consistently_wound,
+    normalised,
+    surface_nodes_first,
+)
+
+MESHES = Path(__file__).parent / "meshes"
+HASHES = "hashes.json"  # beside the meshes
+MAX_SURFACE_NODES = 350  # that a scene records
+SURFACE_FORMATS = {
+    ".stl",
+    ".obj",
+    ".ply",
+    ".off",
+    ".glb",
+}  # by trimesh; .npz is our own, meshio reads the rest
+
+# A user's surface: what to aim at, the better of which is kept.
+TARGETS = {"surface_nodes": (296, 304), "edge_factors": (1.1, 1.3), "envelopes": (0.005,)}
+
+SMALLEST_CELL = 1e-12  # volume over the cube of the largest extent, below which a cell is flat
+SMALLEST_EXTENT = 1e-3  # over the largest
+VOLUME_ROUND_OFF = 1e-9
+
+# Red refinement: the edges' midpoints are the nodes 4..9 of a cell. Four cells keep a corner each; the
+# octahedron between them is cut along one of its diagonals, around which the other midpoints form a ring.
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+CORNER_CELLS = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
+DIAGONALS = np.array([[4, 9], [5, 8], [6, 7]])
+RINGS = np.array([[5, 7, 8, 6], [4, 7, 9, 6], [4, 5, 9, 8]])
+
+
+@dataclass(frozen=True, eq=False)
+class SoftBody:
+    """A body at rest as tetrahedra, its centre of mass at the origin, its largest extent 1, z upright.
+
+    Attributes:
+        name: of the object, or of the file that it came from.
+        vertices: node positions, in units of the body's size, shape [nodes, 3], float64.
+        tetrahedra: node indices of each cell, positive volumes, shape [cells, 4], int32.
+        surface_nodes: the nodes 0..surface_nodes-1 lie on the surface; those are recorded. No other node does,
+            unless the body is refined.
+    """
+
+    name: str
+    vertices: Floats
+    tetrahedra: Indices
+    surface_nodes: int
+
+    @cached_property
+    def surface(self) -> Indices:
+        """Surface triangles, counterclockwise seen from outside, shape [triangles, 3], int32."""
+        return boundary_triangles(self.tetrahedra)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The body as named arrays, as stored and as hashed."""
+        return {
+            "vertices": np.asarray(self.vertices, "<f8"),
+            "tetrahedra": np.asarray(self.tetrahedra, "<i4"),
+            "surface_nodes": np.asarray(self.surface_nodes, "<i4"),
+        }
+
+    def content_hash(self) -> str:
+        """SHA-256 over names, shapes, types and bytes of the arrays; the name does not count."""
+        return hash_arrays(self.arrays()).hexdigest()
+
+    def refined(self) -> "SoftBody":
+        """Every cell cut into eight of positive volume, the octahedron in its middle along the shortest
+        diagonal. Old nodes keep their indices and `surface_nodes` its value, so that the same nodes can be
+        recorded; the midpoints of edges follow."""
+        pairs = np.sort(self.tetrahedra[:, EDGES], axis=-1)
+        edges, places = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+        vertices = np.concatenate([self.vertices, self.vertices[edges].mean(1)])
+        nodes = np.concatenate([self.tetrahedra, len(self.vertices) + places.reshape(-1, len(EDGES))], axis=1)
+        ends = vertices[nodes[:, DIAGONALS]]
+        shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=-1).argmin(1)
+        ring = RINGS[shortest]
+        inner = np.stack(
+            [
+                np.concatenate([DIAGONALS[shortest], ring[:, [side, (side + 1) % 4]]], axis=1)
+                for side in range(4)
+            ],
+            axis=1,
+        )
+        cells = np.concatenate([np.broadcast_to(CORNER_CELLS, inner.shape), inner], axis=1)
+        tetrahedra = np.take_along_axis(nodes[:, None], cells, axis=2).reshape(-1, 4).astype(np.int32)
+        inverted = cell_volumes(vertices, tetrahedra) < 0
+        tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
+        return replace(self, vertices=vertices, tetrahedra=tetrahedra)
+
+
+def object_names() -> tuple[str, ...]:
+    """Names of our own objects, sorted."""
+    return tuple(sorted(json.loads((MESHES / HASHES).read_text())))
+
+
+def load_object(name: str, folder: Path = MESHES) -> SoftBody:
+    """One of our own objects, its content compared with the hash it was published with.
+
+    Raises:
+        GeneratorError: there is no such object, its file is missing or is not what it was.
+    """
+    published = json.loads((folder / HASHES).read_text())
+    if name not in published:
+        raise GeneratorError(f'there is no object "{name}"; there are {", ".join(sorted(published))}')
+    path = folder / f"{name}.npz"
+    body = replace(_read_npz(path), name=name)
+    if body.content_hash() != published[name]["sha256"]:
+        raise GeneratorError(
+            f"{path} is not the published mesh of {name}: its content does not have the SHA-256 of {HASHES}; "
+            "install the package again, or give a mesh of your own with --mesh"
+        )
+    if cell_volumes(body.vertices, body.tetrahedra).min() <= 0:
+        raise GeneratorError(f"{path}: a tetrahedron of {name} has no positive volume")
+    return body
+
+
+def write_object(body: SoftBody, path: Path) -> None:
+    """Keeps a body so that `read_object` gives the very same one again, bit by bit.
+
+    As .npz (what our own objects are kept in), or in a format of meshio's that stores float64, best .vtu.
+
+    Raises:
+        GeneratorError: meshio is missing or does not write this format.
+    """
+    if path.suffix == ".npz":
+        np.savez_compressed(path, **body.arrays())  # type: ignore[arg-type]
+        return
+    meshio = _optional("meshio", path)
+    try:
+        meshio.Mesh(body.vertices, [("tetra", body.tetrahedra)]).write(path)
+    except (meshio.WriteError, KeyError, ValueError) as error:
+        raise GeneratorError(f"{path} cannot be written: {error}; write .vtu or .npz") from error
+
+
+def read_object(path: Path) -> SoftBody:
+    """A user's own object, scaled so that its largest extent is 1, its centre of mass at the origin.
+
+    A tetrahedral mesh (.npz by `write_object`, or .vtu, .vtk, .msh, ... by meshio) is used as it is: nodes are
+    reordered, those of the surface first, and unused ones dropped; cells that are all inverted are turned. A
+    closed surface (.stl, .obj, .ply, .off, .glb, or triangles in a format of meshio's) is remeshed to at most
+    350 nodes and filled with tetrahedra. That is not deterministic: read a surface once, in one process, and
+    keep the result with `write_object` where the same data are to be made again.
+
+    Raises:
+        GeneratorError: the file cannot be read, or what it holds is not one solid body of a usable size; the
+            message says what is wrong and what to do.
+    """
+    if not path.is_file():
+        raise GeneratorError(f"{path}: there is no such file; give a tetrahedral mesh or a closed surface")
+    if path.suffix.lower() == ".npz":
+        stored = _read_npz(path)
+        return _from_tetrahedra(path, stored.vertices, stored.tetrahedra)
+    if path.suffix.lower() in SURFACE_FORMATS:
+        return _from_surface(path, *_read_surface(path))
+    vertices, cells = _read_cells(path)
+    if "tetra" in cells:
+        return _from_tetrahedra(path, vertices, cells["tetra"])
+    return _from_surface(path, vertices, cells["triangle"])
+
+
+def _optional(library: str, path: Path) -> Any:
+    """An optional library, imported for the sake of this file."""
+    import importlib
+
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise GeneratorError(f"{path} needs {library}: pip install 'm3gn-bench[mesh]'") from error
+
+
+def _read_npz(path: Path) -> SoftBody:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return SoftBody(
+                path.stem,
+                stored["vertices"].astype(np.float64),
+                stored["tetrahedra"].astype(np.int32),
+                int(stored["surface_nodes"]),
+            )
+    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise GeneratorError(f"{path} is damaged, or no mesh that write_object wrote: {error}") from error
+
+
+def _read_surface(path: Path) -> tuple[Floats, Indices]:
+    trimesh = _optional("trimesh", path)
+    mesh = _parsed(path, lambda: trimesh.load_mesh(path, process=False))
+    triangles = getattr(mesh, "faces", None)
+    if triangles is None or not len(triangles):
+        raise GeneratorError(f"{path} holds no triangles; export it as a surface mesh, not as a point cloud")
+    _require_finite(path, mesh.vertices)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a file of separate triangles becomes a surface
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+
+
+def _read_cells(path: Path) -> tuple[Floats, dict[str, Indices]]:
+    """Vertices, and the tetrahedra or, where there are none, the triangles."""
+    meshio = _optional("meshio", path)
+    mesh = _parsed(path, lambda: meshio.read(path))
+    cells = {kind: np.asarray(block, np.int32) for kind, block in mesh.cells_dict.items() if len(block)}
+    foreign = sorted(
+        kind for kind in cells if kind.startswith(("tetra1", "hexa", "wedge", "pyramid", "quad", "triangle6"))
+    )
+    solid = [kind for kind in foreign if not kind.startswith(("quad", "triangle"))]
+    if solid or (foreign and not cells.keys() & {"tetra", "triangle"}):
+        raise GeneratorError(f"{path} holds {', '.join(foreign)}; export linear tetrahedra (4 nodes) only")
+    if not cells.keys() & {"tetra", "triangle"}:
+        raise GeneratorError(f"{path} holds neither tetrahedra nor triangles; export the mesh with its cells")
+    return np.asarray(mesh.points, np.float64), cells
+
+
+def _parsed(path: Path, read: Callable[[], Any]) -> Any:
+    """What another library makes of the file; whatever it raises (meshio exits) means that it cannot."""
+    try:
+        return read()
+    except (Exception, SystemExit) as error:
+        raise GeneratorError(
+            f"{path} cannot be read as {path.suffix or 'a mesh'}: {error}; is the file whole, and does its "
+            "name end as its format wants?"
+        ) from error
+
+
+def _require_finite(path: Path, vertices: Floats) -> None:
+    broken = ~np.isfinite(vertices).all(1)
+    if broken.any():
+        raise GeneratorError(
+            f"{path}: {broken.sum()} of {len(vertices)} nodes have coordinates that are not finite (the first "
+            f"is node {broken.argmax()}); export the mesh again"
+        )
+
+
+def _require_shape(path: Path, vertices: Floats, cells: Indices, kind: str) -> None:
+    """Finite three-dimensional nodes of some extent, and cells that refer to them."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise GeneratorError(f"{path}: nodes must have three coordinates, not shape {vertices.shape}")
+    if not len(cells):
+        raise GeneratorError(f"{path} holds no {kind}")
+    if cells.min() < 0 or cells.max() >= len(vertices):
+        raise GeneratorError(
+            f"{path}: {kind} refer to node {cells.max() if cells.min() >= 0 else cells.min()}, but there are "
+            f"{len(vertices)} nodes; the file is damaged"
+        )
+    _require_finite(path, vertices)
+    extents = np.ptp(vertices[np.unique(cells)], axis=0)
+    if extents.min() <= SMALLEST_EXTENT * extents.max():
+        raise GeneratorError(
+            f"{path} is flat: it extends over {' x '.join(f'{extent:.3g}' for extent in extents)}; a soft body "
+            "needs an extent in every direction"
+        )
+
+
+def _from_tetrahedra(path: Path, vertices: Floats, tetrahedra: Indices) -> SoftBody:
+    """The body of a user's tetrahedral mesh, checked."""
+    _require_shape(path, vertices, tetrahedra, "tetrahedra")
+    volumes = cell_volumes(vertices, tetrahedra)
+    if (volumes < 0).all():  # some programs count the corners the other way round
+        tetrahedra, volumes = tetrahedra[:, [0, 2, 1, 3]], -volumes
+    flat = volumes <= SMALLEST_CELL * np.ptp(vertices[np.unique(tetrahedra)], axis=0).max() ** 3
+    if flat.any():
+        raise GeneratorError(
+            f"{path}: {flat.sum()} of {len(tetrahedra)} tetrahedra are flat or inverted (the first is cell "
+            f"{flat.argmax()}), while others are not; mesh the object again, or give its surface as .stl"
+        )
+    parts = component_count(tetrahedra)
+    if parts > 1:
+        raise GeneratorError(
+            f"{path} holds {parts} parts that share no triangle; give one connected body, and merge nodes at "
+            "the same place"
+        )
+    surface = boundary_triangles(tetrahedra)
+    total = volumes.sum()
+    if not is_closed(surface) or abs(enclosed_volume(vertices, surface) - total) > VOLUME_ROUND_OFF * total:
+        raise GeneratorError(
+            f"{path}: tetrahedra overlap or touch in an edge only; mesh the object again, or give its surface "
+            "as .stl"
+        )
+    vertices, tetrahedra, surface_nodes = surface_nodes_first(vertices, tetrahedra)
+    if surface_nodes > MAX_SURFACE_NODES:
+        raise GeneratorError(
+            f"{path} has {surface_nodes} surface nodes, at most {MAX_SURFACE_NODES} are allowed; mesh it more "
+            "coarsely, or give its surface as .stl, which is then done for you"
+        )
+    return SoftBody(path.stem, normalised(vertices, tetrahedra), tetrahedra, surface_nodes)
+
+
+def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
+    """The body inside a user's surface, checked, remeshed and filled with tetrahedra."""
+    _require_shape(path, vertices, triangles, "triangles")
+    corners = np.sort(triangles, axis=1)
+    triangles = triangles[(corners[:, 1:] != corners[:, :-1]).all(1)]  # without those that are only an edge
+    if not is_closed(triangles):
+        raise GeneratorError(
+            f"{path}: the surface is not closed (some edges do not belong to exactly two triangles); fill the "
+            "holes, e.g. with the 3D-print tools of Blender"
+        )
+    parts = component_count(triangles)
+    if parts > 1:
+        raise GeneratorError(f"{path} holds {parts} separate surfaces; unite them, or keep only one")
+    if not is_consistently_wound(triangles):
+        raise GeneratorError(
+            f"{path}: some triangles face inwards and others outwards; recalculate the normals and export again"
+        )
+    volume = enclosed_volume(vertices, triangles)
+    if volume < 0:
+        triangles = triangles[:, ::-1]
+    if abs(volume) <= VOLUME_ROUND_OFF * np.ptp(vertices, axis=0).max() ** 3:
+        raise GeneratorError(f"{path}: the surface encloses no volume; give the surface of a solid body")
+    for library in ("pyvista", "pyacvd", "pytetwild"):
+        _optional(library, path)
+    from m3gn_bench.generators.meshes.remeshing import candidates, recipes
+
+    used, places = np.unique(triangles, return_inverse=True)
+    vertices, triangles = vertices[used], places.reshape(-1, 3).astype(np.int32)
+    usable = [
+        candidate
+        for candidate in candidates(vertices, triangles, recipes(**TARGETS))
+        if candidate.surface_nodes <= MAX_SURFACE_NODES
+    ]
+    if not usable:
+        raise GeneratorError(
+            f"{path}: its shape does not survive at {MAX_SURFACE_NODES} surface nodes; thicken thin walls and "
+            "remove what is finer than about a twentieth of its size, or give a tetrahedral mesh"
+        )
+    best = max(usable, key=lambda candidate: candidate.stable_step)
+    return SoftBody(path.stem, best.vertices, best.tetrahedra, best.surface_nodes)
