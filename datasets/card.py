@@ -3,6 +3,7 @@
 A card is Markdown written by people, with one block between two markers that belongs to this module.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +16,41 @@ from m3gn_bench.datasets.file import (
     read_metadata,
     read_trajectory,
 )
-from m3gn_bench.datasets.schema import TIERS
+from m3gn_bench.datasets.schema import SPLITS, TIERS
 
 CARDS = Path(__file__).parent / "cards"
 BEGIN = "<!-- numbers: written by `m3gn-bench card`, do not edit -->"
 END = "<!-- end of numbers -->"
 
 
-def numbers(path: Path) -> str:
-    """The generated block for a dataset file, without its markers."""
+class Moments:
+    """Mean and variance of vectors that come in batches, without holding them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.mean = np.zeros(())
+        self.variance = np.zeros(())
+
+    def add(self, batch: np.ndarray) -> None:
+        """Take in vectors [..., dim] (Chan, Golub and LeVeque's update)."""
+        vectors = batch.reshape(-1, batch.shape[-1]).astype(np.float64)
+        mean, variance = vectors.mean(0), vectors.var(0)
+        total = self.count + len(vectors)
+        share = len(vectors) / total
+        self.variance = (1 - share) * self.variance + share * variance
+        self.variance = self.variance + share * (1 - share) * (mean - self.mean) ** 2
+        self.mean = (1 - share) * self.mean + share * mean
+        self.count = total
+
+
+def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
+    """The generated block for a dataset file, without its markers; `further` rows stand near the end."""
     with open_file(path) as file:
         metadata = read_metadata(file)
         with damage_as_dataset_error(str(path)):
             keys = list(file["trajectories"])
             splits = {
-                task: "/".join(str(len(group[split])) for split in ("train", "validation", "test"))
+                task: "/".join(str(len(group[split])) for split in SPLITS if split in group)
                 for task, group in file["splits"].items()
             }
         tiers = []
@@ -39,19 +60,23 @@ def numbers(path: Path) -> str:
             except DatasetError:
                 continue
         diagnostics: dict[str, list[float]] = {}
-        steps = []
+        steps = Moments()
+        sizes: dict[str, tuple[int, int]] = {}
         for key in keys:
             trajectory = read_trajectory(file, key)
             for name, value in trajectory.diagnostics.items():
                 diagnostics.setdefault(name, []).append(value)
-            steps.append(np.diff(trajectory.positions / metadata.scale_length, axis=0))
-    moved = np.stack(steps)
-    mesh = trajectory.mesh
+            steps.add(np.diff(trajectory.positions / metadata.scale_length, axis=0))
+            mesh = trajectory.mesh
+            sizes[trajectory.tags.get("object", "")] = (len(mesh.rest_positions), len(mesh.cells))
     rows = [
         ("trajectories", f"{len(keys)}, tier `{metadata.tier}`, dataset version {metadata.dataset_version}"),
         *((f"train/validation/test of `{task}`", sizes) for task, sizes in splits.items()),
         ("frames, transitions", f"{metadata.frames}, {metadata.transitions}"),
-        ("nodes, cells", f"{len(mesh.rest_positions)}, {len(mesh.cells)}"),
+        *(
+            (f"nodes, cells{f' of `{name}`' if len(sizes) > 1 else ''}", f"{nodes}, {cells}")
+            for name, (nodes, cells) in sizes.items()
+        ),
         ("time step", f"{metadata.dt:g} ({metadata.time_unit})"),
         (
             "lengths",
@@ -59,11 +84,12 @@ def numbers(path: Path) -> str:
         ),
         (
             "movement per step, scaled",
-            f"mean {_vector(moved.mean((0, 1, 2)))}, std {_vector(moved.std((0, 1, 2)))}",
+            f"mean {_vector(steps.mean)}, std {_vector(steps.variance**0.5)}",
         ),
         ("rejected draws", "; ".join(f"{r.key}: {r.reason}" for r in metadata.rejections) or "0"),
         ("CPU time per trajectory", _range(diagnostics.pop("cpu_seconds"), " s")),
         *((name.replace("_", " "), _range(values, "")) for name, values in diagnostics.items()),
+        *further,
         ("file size", f"{path.stat().st_size / 1e6:.1f} MB"),
         ("machine", metadata.machine),
         ("versions", ", ".join(f"{k} {v}" for k, v in metadata.simulator_versions.items())),

@@ -7,7 +7,7 @@ Objects the object. Source: paper, sections 5 and C; the original's step, height
 objects are not published, so these are ours.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
@@ -191,6 +191,18 @@ class _FallingObjects:
         if found["max_speed"] > MAX_SPEED_RATIO * np.sqrt(2 * GRAVITY * positions[0, :, 2].max()):
             problems.append(f"a node moves at {found['max_speed']:.1f} m/s, faster than any fall explains")
         return problems
+
+    def extreme_materials(self, parameters: FallParameters) -> tuple[FallParameters, FallParameters]:
+        """The same drop of the softest, most compressible and of the stiffest, least compressible material."""
+        soft, stiff = (
+            replace(
+                parameters,
+                youngs_modulus=float(YOUNGS_MODULI[end]),
+                poisson_ratio=float(POISSON_RATIOS[end]),
+            )
+            for end in (0, -1)
+        )
+        return soft, stiff
 
     def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
         """One task, of the scene's name."""

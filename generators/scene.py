@@ -46,6 +46,11 @@ class Scene(Protocol):
         """Reasons why the trajectory must not enter a dataset; empty if it may."""
         ...
 
+    def extreme_materials(self, parameters: Any) -> tuple[Any, Any]:
+        """The same draw with the softest and with the stiffest material (where nu alone varies: the smallest
+        and the largest)."""
+        ...
+
     def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
         """The tasks in whose `split` a trajectory with this material takes part."""
         ...

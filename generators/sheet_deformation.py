@@ -7,7 +7,7 @@ The load's place and sign and Young's modulus vary. Source: paper, sections 5 an
 thickness, Poisson's ratio and load history follow the description of the original Abaqus data.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import ClassVar
 
@@ -154,6 +154,13 @@ class SheetDeformation:
         if strain < MIN_PRINCIPAL_STRAIN:
             problems.append(f"compressive membrane strain {strain:.2f}: beyond the material law's stability")
         return problems
+
+    def extreme_materials(self, parameters: SheetParameters) -> tuple[SheetParameters, SheetParameters]:
+        """The same forces on the softest and on the stiffest sheet."""
+        return (
+            replace(parameters, youngs_modulus=YOUNGS_MODULI[0]),
+            replace(parameters, youngs_modulus=YOUNGS_MODULI[-1]),
+        )
 
     def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
         """All take part in the main task; the other one trains inside E's range and tests outside it."""

@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -259,16 +260,59 @@ def info(file: Path, as_json: bool) -> None:
 @click.argument("file", type=click.Path(path_type=Path))
 @JSON
 def card(file: Path, as_json: bool) -> None:
-    """Write the numbers of a dataset FILE into its scene's card."""
+    """Write the numbers of a dataset FILE into its scene's card, and record its hashes."""
     from m3gn_bench.datasets.card import CARDS, fill, numbers
     from m3gn_bench.datasets.file import open_file, read_metadata
+    from m3gn_bench.datasets.recorded import record
     from m3gn_bench.datasets.writer import write_bytes_atomically
+    from m3gn_bench.generators.material_effect import material_effect
+    from m3gn_bench.generators.scene import get_scene
 
     with open_file(file) as opened:
-        scene = read_metadata(opened).scene
-    path = CARDS / f"{scene}.md"
-    write_bytes_atomically(path, fill(path.read_text(), numbers(file)).encode())
-    Report(as_json).finish({"card": str(path)}, f"{path}: written")
+        scene = get_scene(read_metadata(opened).scene)
+    effect = ("softest against stiffest material, mean squared difference, scaled", material_effect(scene))
+    path = CARDS / f"{scene.name}.md"
+    block = numbers(file, [(effect[0], f"{effect[1]:.3g}")])
+    write_bytes_atomically(path, fill(path.read_text(), block).encode())
+    recorded = record(file)
+    Report(as_json).finish(
+        {"card": str(path), "record": str(recorded)}, f"{path}: written\n{recorded}: written"
+    )
+
+
+@cli.command()
+@click.argument("scene_name", metavar="[SCENE]", required=False)
+@click.option("--tier", default="quick", show_default=True, help="smoke, quick or paper.")
+@WORKERS
+@JSON
+def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) -> None:
+    """Generate a SCENE's dataset from nothing and compare it with the recorded one; exit code 1 if it differs.
+
+    Without SCENE, the one whose turn it is today.
+    """
+    from m3gn_bench.datasets.recorded import compare, read_record
+    from m3gn_bench.generators.generate import generate as generate_dataset
+    from m3gn_bench.generators.scene import get_scene, scene_names
+
+    names = scene_names()
+    scene = get_scene(scene_name or names[date.today().toordinal() % len(names)])
+    read_record(scene.name)  # complain before the work, not after it
+    report = Report(as_json)
+    with TemporaryDirectory() as folder, report.progress(f"simulating {scene.name}") as on_progress:
+        made = generate_dataset(scene, tier, Path(folder), workers=workers, on_progress=on_progress)
+        outcome = compare(made.file)
+    agreement = (
+        "bit-identical to the record"
+        if outcome.identical
+        else f"not bit-identical; largest difference {outcome.largest_difference:.1e} of the scene's half-width "
+        f"(allowed {outcome.tolerance:g}, for processors that round differently)"
+    )
+    report.finish(
+        outcome.model_dump(mode="json") | {"ok": outcome.ok, "content_hash": made.content_hash},
+        f"{scene.name}, tier {tier}, {made.trajectories} trajectories: {agreement}\n"
+        + ("the dataset is reproduced" if outcome.ok else "this is NOT the recorded dataset"),
+    )
+    sys.exit(0 if outcome.ok else 1)
 
 
 @cli.command()

@@ -97,7 +97,7 @@ class ExplicitSolid(TetrahedralSolid):
         self._start = wp.array(start, dtype=wp.int32, device=device)
         self._cell_volumes = wp.zeros(self.cells, dtype=wp.float64, device=device)
         self._pressures = wp.zeros(self.nodes, dtype=wp.float64, device=device)
-        self._forces = wp.zeros((self.cells, 4), dtype=wp.vec3d, device=device)
+        self._forces = wp.zeros(4 * self.cells, dtype=wp.vec3d, device=device)
         self._x = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
         self._v = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
 
@@ -115,8 +115,10 @@ class ExplicitSolid(TetrahedralSolid):
 
     def substeps(self, frame_time: float, courant: float) -> int:
         """Substeps per frame that keep leapfrog at `courant` times its limit of stability at rest."""
-        rate = (self.highest_frequency + self.highest_damping_rate) / 2
-        return max(MIN_SUBSTEPS, int(np.ceil(frame_time * rate / courant)))
+        # x'' = -r x' - omega^2 x, with the damping taken of the last half step, is stable up to this step.
+        omega, r = self.highest_frequency, self.highest_damping_rate
+        limit = (np.sqrt(r**2 + 4 * omega**2) - r) / omega**2
+        return max(MIN_SUBSTEPS, int(np.ceil(frame_time / (courant * limit))))
 
     def _largest_eigenvalue(self, mu: float, lam: float) -> float:
         """Of M^-1 K at rest, where K has the Lame constants mu and lam."""
@@ -187,7 +189,7 @@ class ExplicitSolid(TetrahedralSolid):
         self._v.assign(np.ascontiguousarray(velocities, dtype=np.float64))
         self._launch_forces()
         corner_forces = self._forces.numpy()
-        forces = np.stack([self.gather(corner_forces[:, :, axis].ravel()) for axis in range(3)], axis=1)
+        forces = np.stack([self.gather(corner_forces[:, axis]) for axis in range(3)], axis=1)
         gravity = np.where(self._inverse_masses > 0, -self.gravity, 0.0)
         return forces * self._inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
 
@@ -262,11 +264,12 @@ def _corner_forces(
     lam: wp.float64,
     viscosity: wp.float64,
     nodal_pressure: wp.bool,
-    forces: wp.array2d(dtype=wp.vec3d),
+    forces: wp.array(dtype=wp.vec3d),
 ):
     cell = wp.tid()
     corners = tetrahedra[cell]
     inverse_edges = rest[cell]
+    zero = wp.float64(0.0)
     F = _deformation_gradient(x, corners, inverse_edges)
     f1 = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
     f2 = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
@@ -279,23 +282,24 @@ def _corner_forces(
             pressures[corners[0]] + pressures[corners[1]] + pressures[corners[2]] + pressures[corners[3]]
         )
     cofactor = wp.matrix_from_cols(c1, wp.cross(f3, f1), wp.cross(f1, f2))
-    stress = F * mu + cofactor * (mu * dilatation - mu + pressure)
-    if viscosity > wp.float64(0.0):
+    second = wp.mat33d(mu, zero, zero, zero, mu, zero, zero, zero, mu)
+    if viscosity > zero:
         rate = wp.transpose(F) * _deformation_gradient(v, corners, inverse_edges)
-        stress += F * (rate + wp.transpose(rate)) * viscosity  # S = 2 eta dE/dt, dE/dt = sym(F^T dF/dt)
-    H = stress * wp.transpose(inverse_edges) * volumes[cell]
+        second += (rate + wp.transpose(rate)) * viscosity  # S = 2 eta dE/dt, dE/dt = sym(F^T dF/dt)
+    stress = F * second + cofactor * (mu * dilatation - mu + pressure)
+    H = stress * wp.transpose(inverse_edges * volumes[cell])
     a = wp.vec3d(H[0, 0], H[1, 0], H[2, 0])
     b = wp.vec3d(H[0, 1], H[1, 1], H[2, 1])
     c = wp.vec3d(H[0, 2], H[1, 2], H[2, 2])
-    forces[cell, 0] = a + b + c
-    forces[cell, 1] = -a
-    forces[cell, 2] = -b
-    forces[cell, 3] = -c
+    forces[4 * cell] = a + b + c
+    forces[4 * cell + 1] = -a
+    forces[4 * cell + 2] = -b
+    forces[4 * cell + 3] = -c
 
 
 @wp.kernel
 def _move(
-    forces: wp.array2d(dtype=wp.vec3d),
+    forces: wp.array(dtype=wp.vec3d),
     start: wp.array(dtype=wp.int32),
     incident: wp.array(dtype=wp.int32),
     inverse_masses: wp.array(dtype=wp.float64),
@@ -312,8 +316,7 @@ def _move(
         return
     force = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
     for entry in range(start[node], start[node + 1]):
-        corner = incident[entry]
-        force += forces[corner // 4, corner % 4]
+        force += forces[incident[entry]]
     u = v[node] + force * (substep * inverse_mass)
     u = wp.vec3d(u[0], u[1], u[2] - gravity * substep)
     arrival = -x[node][2] / substep  # the velocity with which the node just reaches the floor

@@ -1,0 +1,124 @@
+"""What a dataset was when it was recorded, so that anybody can tell whether they made the same.
+
+The same code on the same kind of processor gives the same bits. Another processor may round differently in the
+last digit (other vector instructions, fused multiply-add), which changes the content hash but nothing that
+matters; for that case a few coordinates of every quick-tier trajectory are kept and compared with a tolerance.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, read_trajectory, stored_hashes
+from m3gn_bench.datasets.schema import SMALL_TIERS, TIERS, Record, in_tier
+from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.datasets.writer import write_bytes_atomically
+
+FOLDER = Path(__file__).parent / "recorded"
+PROBED_FRAMES = 3
+PROBED_NODES = 4
+# In scaled units, as are all errors on the leaderboard. Rounding alone stays far below: adding 1e-12 m to the
+# start of a falling body moves it by less than 1e-6 after 2 s (`validation/test_falling.py`).
+TOLERANCE = 1e-4
+
+
+class RecordedDataset(Record):
+    """Hashes of a scene's tiers, and probes of the quick tier: coordinates by trajectory."""
+
+    scene: str
+    dataset_version: str
+    generator_version: str
+    simulator_versions: dict[str, str]
+    machine: str
+    hashes: dict[str, str]
+    probes: dict[str, tuple[float, ...]]
+
+
+class Reproduction(Record):
+    """How a dataset file compares with the record: bit by bit, or at least by its probes."""
+
+    scene: str
+    tier: str
+    file: str
+    identical: bool
+    trajectories: int
+    largest_difference: float  # scaled units; 0 if identical
+    tolerance: float = TOLERANCE
+
+    @property
+    def ok(self) -> bool:
+        """Whether this is the recorded dataset, up to rounding."""
+        return self.identical or self.largest_difference <= self.tolerance
+
+
+def probe(trajectory: Trajectory) -> tuple[float, ...]:
+    """Coordinates of a few nodes in a few frames, the last one among them, in physical units."""
+    frames, nodes, _ = trajectory.positions.shape
+    chosen_frames = np.linspace(0, frames - 1, PROBED_FRAMES + 1, dtype=int)[1:]
+    chosen_nodes = np.linspace(0, nodes - 1, PROBED_NODES + 2, dtype=int)[1:-1]
+    return tuple(trajectory.positions[np.ix_(chosen_frames, chosen_nodes)].ravel().tolist())
+
+
+def record(path: Path, folder: Path = FOLDER) -> Path:
+    """Record a dataset file, which must hold the quick tier or more; returns the record's path."""
+    with open_file(path) as file:
+        metadata = read_metadata(file)
+        hashes = {}
+        for tier in TIERS:
+            try:
+                hashes[tier] = content_hash(file, tier)
+            except DatasetError:
+                continue
+        quick = sorted(key for key in stored_hashes(file) if in_tier(key, SMALL_TIERS["quick"]))
+        recorded = RecordedDataset(
+            scene=metadata.scene,
+            dataset_version=metadata.dataset_version,
+            generator_version=metadata.generator_version,
+            simulator_versions=metadata.simulator_versions,
+            machine=metadata.machine,
+            hashes=hashes,
+            probes={key: probe(read_trajectory(file, key)) for key in quick},
+        )
+    destination = folder / f"{metadata.scene}.json"
+    write_bytes_atomically(destination, (recorded.model_dump_json(indent=1) + "\n").encode())
+    return destination
+
+
+def read_record(scene: str, folder: Path = FOLDER) -> RecordedDataset:
+    """What is recorded of a scene. Raises DatasetError if nothing is."""
+    path = folder / f"{scene}.json"
+    if not path.is_file():
+        raise DatasetError(f"nothing is recorded of {scene}; `m3gn-bench card FILE` records a dataset file")
+    return RecordedDataset.model_validate_json(path.read_bytes())
+
+
+def compare(path: Path, folder: Path = FOLDER) -> Reproduction:
+    """Compare a dataset file with what is recorded of its scene.
+
+    Raises:
+        DatasetError: nothing is recorded of this scene, version or tier.
+    """
+    with open_file(path) as file:
+        metadata = read_metadata(file)
+        recorded = read_record(metadata.scene, folder)
+        if recorded.dataset_version != metadata.dataset_version or metadata.tier not in recorded.hashes:
+            raise DatasetError(
+                f"{path} holds version {metadata.dataset_version}, tier {metadata.tier}; recorded of "
+                f"{metadata.scene} are version {recorded.dataset_version}, tiers {', '.join(recorded.hashes)}"
+            )
+        identical = content_hash(file, metadata.tier) == recorded.hashes[metadata.tier]
+        keys = [key for key in stored_hashes(file) if key in recorded.probes]
+        largest = 0.0
+        if not identical:
+            for key in keys:
+                difference = np.subtract(probe(read_trajectory(file, key)), recorded.probes[key])
+                largest = max(largest, float(np.abs(difference).max()) / metadata.scale_length)
+    return Reproduction(
+        scene=metadata.scene,
+        tier=metadata.tier,
+        file=str(path),
+        identical=identical,
+        trajectories=len(keys),
+        largest_difference=largest,
+    )
