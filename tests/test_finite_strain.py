@@ -8,7 +8,7 @@ import pytest
 from skfem import ElementHexS2, ElementQuad1, ElementQuadS2, ElementTetP1, Mesh, MeshHex, MeshQuad, MeshTet
 
 from m3gn_bench.generators.errors import SolverError
-from m3gn_bench.generators.solvers.contact import Disc, Floor, PenaltyContact
+from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Response, Setting, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
@@ -77,13 +77,8 @@ def obstacles_around(solid: Solid) -> PenaltyContact:
     """A ball that dents the top, and a floor that the sides hang below."""
     d = solid.dimension
     ball = Disc(radius=0.4, start=(0.45,) * (d - 1) + (1.3,), velocity=(0.0,) * (d - 1) + (-0.1,))
-    return PenaltyContact(
-        solid,
-        boundary_facets(solid),
-        integration_order=5,
-        penalty=3 * E,
-        obstacles=[ball, Floor(0.2)],
-    )
+    points = BoundaryPoints(solid, boundary_facets(solid), integration_order=5)
+    return PenaltyContact(points, penalty=3 * E, obstacles=[ball, Floor(0.2)])
 
 
 # --- the law ----------------------------------------------------------------------------------------------

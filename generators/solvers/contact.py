@@ -18,18 +18,16 @@ from m3gn_bench.generators.solvers.sparse import Array
 
 
 class Obstacle(Protocol):
-    """A rigid body whose place depends on time alone."""
+    """A rigid body whose place depends on time alone. Points have the shape [points, d]."""
 
-    def depth(self, points: Array, time: float) -> tuple[Array, Array, Array]:
-        """Where points lie with respect to the obstacle.
+    def depth(self, points: Array, time: float) -> Array:
+        """How deep points lie below the surface at that time, negative outside, shape [points]."""
+        ...
 
-        Args:
-            points: shape [points, d].
-            time: at which the obstacle is looked at.
+    def normal(self, points: Array, time: float) -> tuple[Array, Array]:
+        """Outward normal n, shape [points, d], and curvature c of the level sets of the depth, shape [points].
 
-        Returns:
-            Depth below the surface (negative outside), shape [points]; outward normal n, shape [points, d];
-            curvature c of the level sets, shape [points]: the normal changes by c (I - n n^T) per length.
+        The normal changes by c (I - n n^T) per length.
         """
         ...
 
@@ -52,12 +50,16 @@ class Disc:
         """Shape [d]."""
         return np.array(self.start) + time * np.array(self.velocity)
 
-    def depth(self, points: Array, time: float) -> tuple[Array, Array, Array]:
+    def depth(self, points: Array, time: float) -> Array:
         """See Obstacle."""
         offset = points - self.centre(time)
-        distance = np.sqrt(np.einsum("pi,pi->p", offset, offset))
-        inverse = 1 / np.maximum(distance, 1e-9 * self.radius)
-        return self.radius - distance, offset * inverse[:, None], inverse
+        return self.radius - np.sqrt((offset * offset).sum(-1))
+
+    def normal(self, points: Array, time: float) -> tuple[Array, Array]:
+        """See Obstacle."""
+        offset = points - self.centre(time)
+        distance = np.maximum(np.sqrt((offset * offset).sum(-1)), 1e-9 * self.radius)
+        return offset / distance[:, None], 1 / distance
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,24 @@ class Floor:
 
     height: float
 
-    def depth(self, points: Array, time: float) -> tuple[Array, Array, Array]:
+    def depth(self, points: Array, time: float) -> Array:
+        """See Obstacle."""
+        return self.height - points[:, -1]
+
+    def normal(self, points: Array, time: float) -> tuple[Array, Array]:
         """See Obstacle."""
         normal = np.zeros_like(points)
         normal[:, -1] = 1
-        return self.height - points[:, -1], normal, np.zeros(len(points))
+        return normal, np.zeros(len(points))
+
+
+class _Touch(NamedTuple):
+    """The contact points inside one obstacle: their indices, and everything weighted for integration."""
+
+    points: NDArray[np.intp]
+    normal: Array  # [touching, d]
+    stiffness: Array  # eps, weighted
+    bending: Array  # pressure times curvature, weighted
 
 
 class ContactState(NamedTuple):
@@ -78,146 +93,125 @@ class ContactState(NamedTuple):
 
     Attributes:
         energy: of the penalty.
-        force: its derivative with respect to the displacement, shape [dofs].
+        force: its derivative with respect to the displacement, shape [dofs]; None without contact.
         resultants: force of the body on each obstacle, shape [obstacles, d].
         max_penetration: of each obstacle, 0 without contact, shape [obstacles].
-        hessians: d^2 energy / dx^2 at the contact points, weighted, shape [facets, points, d, d].
     """
 
     energy: float
-    force: Array
+    force: Array | None
     resultants: Array
     max_penetration: Array
-    hessians: Array
+    touches: tuple[_Touch, ...]
 
 
-class PenaltyContact:
-    """The penalty energy on a part of a solid's boundary.
+class BoundaryPoints:
+    """Gauss points on a part of a solid's boundary, and the basis functions that do not vanish there.
+
+    Never changed, so many simulations may share it.
 
     Args:
         solid: the body.
-        facets: indices of boundary facets of its mesh that may touch an obstacle.
+        facets: indices of boundary facets of its mesh.
         integration_order: polynomial degree that the facets' Gauss rule integrates exactly (5: three points
             on an edge).
-        penalty: eps [pressure per length].
-        obstacles: rigid bodies.
+
+    Attributes:
+        elements: behind each facet, shape [facets].
+        dofs, local_dofs: of the functions, in the solid and in the element, shape [facets, d * functions].
+        values: of the functions, shape [facets, points, functions].
+        weights: of integration over the boundary at rest, shape [facets, points].
     """
 
-    def __init__(
-        self,
-        solid: Solid,
-        facets: NDArray[np.integer],
-        *,
-        integration_order: int,
-        penalty: float,
-        obstacles: Sequence[Obstacle],
-    ) -> None:
-        self.penalty = penalty
-        self.obstacles = tuple(obstacles)
-        self._boundary = _Boundary.of(solid, facets, integration_order)
-
-    @property
-    def elements(self) -> NDArray[np.int64]:
-        """The element behind every facet, shape [facets]."""
-        return self._boundary.elements
-
-    def positions(self, u: Array) -> Array:
-        """Where the contact points are under the displacement u [dofs], shape [facets, points, d]."""
-        return self._boundary.positions(u)
-
-    def evaluate(self, u: Array, time: float) -> ContactState:
-        """Energy, forces and Hessians under the displacement u, shape [dofs]."""
-        boundary = self._boundary
-        facets, points, _ = boundary.values.shape
-        x = boundary.positions(u)
-        d = x.shape[-1]
-        x = x.reshape(-1, d)
-        weights = self.penalty * boundary.weights.ravel()
-        energy = 0.0
-        traction = np.zeros_like(x)
-        hessians = np.zeros((len(x), d, d))
-        resultants = np.zeros((len(self.obstacles), d))
-        max_penetration = np.zeros(len(self.obstacles))
-        for k, obstacle in enumerate(self.obstacles):
-            depth, normal, curvature = obstacle.depth(x, time)
-            inside = np.flatnonzero(depth > 0)
-            if not inside.size:
-                continue
-            depth, n, stiffness = depth[inside], normal[inside], weights[inside]
-            pressure = stiffness * depth
-            energy += 0.5 * float(pressure @ depth)
-            push = pressure[:, None] * n
-            traction[inside] -= push
-            resultants[k] = -push.sum(0)
-            max_penetration[k] = depth.max()
-            bending = pressure * curvature[inside]
-            hessians[inside] += ((stiffness + bending)[:, None] * n)[:, :, None] * n[:, None, :]
-            for i in range(d):
-                hessians[inside, i, i] -= bending
-        if energy:
-            nodal = boundary.values_transposed @ traction.reshape(facets, points, d)
-            force: Array = np.bincount(boundary.dofs.ravel(), nodal.ravel(), len(u)).astype(
-                np.float64, copy=False
-            )
-        else:
-            force = np.zeros_like(u)
-        return ContactState(
-            energy, force, resultants, max_penetration, hessians.reshape(facets, points, d, d)
-        )
-
-    def add_stiffness(self, state: ContactState, matrices: Array) -> None:
-        """Add the second derivative of the energy to the element matrices [elements, n, n] of the solid."""
-        active = np.flatnonzero(state.hessians.any((1, 2, 3)))
-        if not active.size:
-            return
-        boundary = self._boundary
-        values = boundary.values[active]
-        size = values.shape[-1] * state.hessians.shape[-1]
-        facet = np.einsum("fqa,fqij,fqb->faibj", values, state.hessians[active], values, optimize=False)
-        local = boundary.local_dofs[active]
-        np.add.at(
-            matrices,
-            (boundary.elements[active, None, None], local[:, :, None], local[:, None, :]),
-            facet.reshape(-1, size, size),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Boundary:
-    """Basis functions on facets; the functions that vanish there are left out."""
-
-    elements: NDArray[np.int64]  # [facets]
-    dofs: NDArray[np.int64]  # [facets, functions * d], of the solid
-    local_dofs: NDArray[np.int64]  # [facets, functions * d], within the element
-    nodes: NDArray[np.int64]  # [facets, functions]
-    values: Array  # [facets, points, functions]
-    values_transposed: Array
-    weights: Array  # [facets, points]
-    rest: Array  # [facets, points, d]
-
-    @classmethod
-    def of(cls, solid: Solid, facets: NDArray[np.integer], integration_order: int) -> "_Boundary":
+    def __init__(self, solid: Solid, facets: NDArray[np.integer], integration_order: int) -> None:
         basis = FacetBasis(solid.mesh, solid.basis.elem, facets=facets, intorder=integration_order)
         values = np.array([np.broadcast_to(np.asarray(f[0]), basis.dx.shape) for f in basis.basis])
         values = values.transpose(1, 2, 0)  # facet, point, function
         there = np.abs(values).max(1) > 1e-12
         functions = int(there.sum(1).max())
         local = np.sort(np.argsort(~there, axis=1, kind="stable")[:, :functions], axis=1)
-        rows = np.arange(len(local))[:, None]
-        nodes = basis.element_dofs.T[rows, local].astype(np.int64)
-        values = np.ascontiguousarray(np.take_along_axis(values, local[:, None, :], axis=2))
         d = solid.dimension
         component = np.arange(d)
-        return cls(
-            elements=solid.mesh.f2t[0, facets].astype(np.int64),
-            dofs=(d * nodes[:, :, None] + component).reshape(len(nodes), -1),
-            local_dofs=(d * local[:, :, None] + component).reshape(len(nodes), -1),
-            nodes=nodes,
-            values=values,
-            values_transposed=np.ascontiguousarray(values.swapaxes(1, 2)),
-            weights=np.ascontiguousarray(basis.dx),
-            rest=values @ solid.nodes[nodes],
-        )
+        self._nodes = np.take_along_axis(basis.element_dofs.T.astype(np.int64), local, axis=1)
+        self.elements: NDArray[np.int64] = solid.mesh.f2t[0, facets].astype(np.int64)
+        self.dofs = (d * self._nodes[:, :, None] + component).reshape(len(local), -1)
+        self.local_dofs = (d * local[:, :, None] + component).reshape(len(local), -1)
+        self.values = np.ascontiguousarray(np.take_along_axis(values, local[:, None, :], axis=2))
+        self.values_transposed = np.ascontiguousarray(self.values.swapaxes(1, 2))
+        self.weights: Array = np.ascontiguousarray(basis.dx)
+        self.rest: Array = self.values @ solid.nodes[self._nodes]
 
     def positions(self, u: Array) -> Array:
-        return self.rest + self.values @ u.reshape(-1, self.rest.shape[-1])[self.nodes]
+        """Where the points are under displacements u [..., dofs], shape [..., facets, points, d]."""
+        d = self.rest.shape[-1]
+        return self.rest + self.values @ u.reshape(*u.shape[:-1], -1, d)[..., self._nodes, :]
+
+
+class PenaltyContact:
+    """The penalty energy on a part of a solid's boundary.
+
+    Args:
+        boundary: the points that may touch an obstacle.
+        penalty: eps [pressure per length].
+        obstacles: rigid bodies.
+    """
+
+    def __init__(self, boundary: BoundaryPoints, *, penalty: float, obstacles: Sequence[Obstacle]) -> None:
+        self.boundary = boundary
+        self.penalty = penalty
+        self.obstacles = tuple(obstacles)
+
+    def evaluate(self, u: Array, time: float) -> ContactState:
+        """Energy and forces under the displacement u, shape [dofs]."""
+        boundary = self.boundary
+        positions = boundary.positions(u)
+        facets, points, d = positions.shape
+        x = positions.reshape(-1, d)
+        energy = 0.0
+        resultants = np.zeros((len(self.obstacles), d))
+        max_penetration = np.zeros(len(self.obstacles))
+        touches = []
+        traction: Array | None = None
+        for k, obstacle in enumerate(self.obstacles):
+            depth = obstacle.depth(x, time)
+            inside = (depth > 0).nonzero()[0]
+            if not inside.size:
+                continue
+            depth = depth[inside]
+            normal, curvature = obstacle.normal(x[inside], time)
+            stiffness = self.penalty * boundary.weights.ravel()[inside]
+            pressure = stiffness * depth
+            energy += 0.5 * float(pressure @ depth)
+            if traction is None:
+                traction = np.zeros_like(x)
+            push = pressure[:, None] * normal
+            traction[inside] -= push
+            resultants[k] = -push.sum(0)
+            max_penetration[k] = depth.max()
+            touches.append(_Touch(inside, normal, stiffness, pressure * curvature))
+        force: Array | None = None
+        if traction is not None:
+            nodal = boundary.values_transposed @ traction.reshape(facets, points, d)
+            force = np.bincount(boundary.dofs.ravel(), nodal.ravel(), len(u)).astype(np.float64, copy=False)
+        return ContactState(energy, force, resultants, max_penetration, tuple(touches))
+
+    def add_stiffness(self, state: ContactState, matrices: Array) -> None:
+        """Add the second derivative of the energy to the element matrices [elements, n, n] of the solid."""
+        boundary = self.boundary
+        facets, points, functions = boundary.values.shape
+        d = boundary.rest.shape[-1]
+        for touch in state.touches:
+            n = touch.normal
+            hessians = ((touch.stiffness + touch.bending)[:, None] * n)[:, :, None] * n[:, None, :]
+            for i in range(d):
+                hessians[:, i, i] -= touch.bending
+            facet, point = np.divmod(touch.points, points)
+            values = boundary.values[facet, point]
+            blocks = (
+                values[:, :, None, None, None]
+                * hessians[:, None, :, None, :]
+                * values[:, None, None, :, None]
+            )
+            local = boundary.local_dofs[facet]
+            where = (boundary.elements[facet, None, None], local[:, :, None], local[:, None, :])
+            np.add.at(matrices, where, blocks.reshape(len(n), functions * d, functions * d))

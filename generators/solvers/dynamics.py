@@ -42,7 +42,9 @@ class ConstrainedSolid:
         self.solid = solid
         self.constrained = np.unique(constrained)
         free = np.setdiff1d(np.arange(solid.dofs), self.constrained)
-        self.assembler = BandedAssembler(solid.element_dofs, free, solid.dofs)
+        # Sorted along its longest side a regular mesh has the narrowest band.
+        by_axis = [np.argsort(np.repeat(x, solid.dimension)[free], kind="stable") for x in solid.nodes.T]
+        self.assembler = BandedAssembler(solid.element_dofs, free, solid.dofs, orders=by_axis)
         self.banded_mass = self.assembler.matrix(solid.element_mass_matrices())
         nodes, functions = solid.element_nodes, solid.element_nodes.shape[1]
         rows, columns = np.repeat(nodes, functions, axis=1).ravel(), np.tile(nodes, (1, functions)).ravel()
@@ -115,7 +117,8 @@ class IncrementalPotential:
         if self.contact is not None:
             self.contact_state = self.contact.evaluate(u, self.time)
             energy += self.contact_state.energy
-            force += self.contact_state.force
+            if self.contact_state.force is not None:
+                force += self.contact_state.force
         if self._mass_factor:
             offset = u - self._predicted
             inertia = self._mass_factor * (self.body.nodal_mass @ offset.reshape(-1, solid.dimension)).ravel()
@@ -165,6 +168,7 @@ class ImplicitDynamics:
     Attributes:
         time: reached.
         displacement, velocity: of all degrees of freedom then, shape [dofs].
+        contact_forces: of the body on each obstacle then.
         min_jacobian: smallest J at a Gauss point in any step so far.
         max_penetration: deepest of any contact point in any step so far.
     """
@@ -202,6 +206,14 @@ class ImplicitDynamics:
     def displacement(self) -> Array:
         """Shape [dofs]."""
         return self._now.displacement
+
+    @property
+    def contact_forces(self) -> Array:
+        """Of the body on each obstacle at the end of the last step, shape [obstacles, d]."""
+        state = self.potential.contact_state
+        if state is None:
+            raise ValueError("no contact, or no step yet")
+        return state.resultants
 
     @property
     def velocity(self) -> Array:

@@ -5,6 +5,8 @@ to matrix slots is computed once. Below a few thousand unknowns a banded Cholesk
 sparse LU, and it reports an indefinite matrix, which LU does not.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
@@ -21,9 +23,17 @@ class BandedAssembler:
         element_dofs: global degrees of freedom of every element, shape [elements, local_dofs].
         free: the unconstrained degrees of freedom, shape [unknowns].
         dofs: number of all degrees of freedom.
+        orders: permutations of the unknowns that might make the band narrow; the given numbering and reverse
+            Cuthill-McKee are tried in any case.
     """
 
-    def __init__(self, element_dofs: NDArray[np.int64], free: NDArray[np.int64], dofs: int) -> None:
+    def __init__(
+        self,
+        element_dofs: NDArray[np.int64],
+        free: NDArray[np.int64],
+        dofs: int,
+        orders: Sequence[NDArray[np.integer]] = (),
+    ) -> None:
         self.free = free
         self.dofs = dofs
         self.unknowns = len(free)
@@ -41,8 +51,12 @@ class BandedAssembler:
             shape=(self.unknowns,) * 2,
         )
         # On a rectangular mesh numbered row by row the given order beats Cuthill-McKee, which goes diagonally.
-        orders = (np.arange(self.unknowns), reverse_cuthill_mckee(pattern, symmetric_mode=True))
-        self._order = min(orders, key=lambda order: _bandwidth(rows[inside], columns[inside], order))
+        candidates = (
+            np.arange(self.unknowns),
+            reverse_cuthill_mckee(pattern, symmetric_mode=True),
+            *orders,
+        )
+        self._order = min(candidates, key=lambda order: _bandwidth(rows[inside], columns[inside], order))
         rank = np.argsort(self._order)
         banded_row, banded_column = rank[rows], rank[columns]
         lower = inside & (banded_row >= banded_column)
