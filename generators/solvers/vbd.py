@@ -1,0 +1,210 @@
+"""Soft solids that fall on a rigid floor, moved by Newton's vertex block descent, to compare with `explicit`.
+
+Vertex block descent (Chen, Liu, Yang and Yuksel, 2024) takes steps of implicit Euler, each by Gauss-Seidel sweeps
+over the nodes, colour by colour. Where the sweeps are too few the step is not solved and the solid is as stiff
+as sweeps and steps let it be, not as E says.
+
+What Newton's parameters mean (release 1.8; the tests measure it):
+
+- Its tetrahedral energy is that of `tetrahedra` without nodal pressure. It takes the Lame constants mu and lambda of
+  small strain and makes those of Smith et al. (lambda + mu, alpha = 1 + mu / (lambda + mu)) of them itself.
+- Its damping stress is, with C = F^T F, S = 4 k_damp (C_now - C_before) / (2 dt), so 4 k_damp dE/dt: objective, and
+  the Kelvin-Voigt viscosity of `explicit`, 2 eta dE/dt, where k_damp = eta / 2.
+- Implicit Euler damps too, more with longer steps: a mode of angular frequency omega like a viscous damper of ratio
+  omega dt / 2. Against it no parameter helps, only substeps.
+- The floor is a linear spring under each node, without damping, and Coulomb's law smoothed below FRICTION_SPEED.
+
+Positions are in single precision.
+"""
+
+import importlib.util
+import logging
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from m3gn_bench.generators.errors import GeneratorError, SolverError
+from m3gn_bench.generators.solvers.quiet_warp import wp
+from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
+
+wp.set_module_options({"enable_backward": False})
+
+FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 1 kN sinks in by 0.1 mm
+FLOOR_SKIN = 1e-4  # [m], the height at which the floor's springs begin
+FRICTION_SPEED = 1e-2  # [m/s], slower sliding is resisted less than Coulomb's law says
+ANYWHERE = 1e6  # [m], so far from the floor a node's contact is known beforehand
+CAPTURED = 10  # substeps per recorded graph, at most
+
+
+class VertexBlockDescent(TetrahedralSolid):
+    """A soft solid on plain linear tetrahedra over a floor, moved by Newton's `SolverVBD`.
+
+    Args:
+        vertices: stress-free positions [m], shape [nodes, 3].
+        tetrahedra: node indices, positively oriented, shape [cells, 4].
+        density: [kg/m^3].
+        youngs_modulus: [Pa].
+        poisson_ratio: nu in (-1, 0.5).
+        viscosity: eta [Pa s].
+        friction: Coulomb's coefficient of the floor.
+        gravity: [m/s^2].
+        floor: whether there is one.
+        fixed: nodes that do not move.
+        iterations: sweeps over the nodes in each substep.
+        device: of Warp, "cpu" or "cuda:0".
+
+    Raises:
+        GeneratorError: Newton is not installed.
+        ValueError: a parameter out of its physical range, or a tetrahedron without volume.
+    """
+
+    def __init__(
+        self,
+        vertices: Array,
+        tetrahedra: NDArray[np.int32],
+        *,
+        density: float,
+        youngs_modulus: float,
+        poisson_ratio: float,
+        viscosity: float = 0.0,
+        friction: float = 0.0,
+        gravity: float = 9.81,
+        floor: bool = True,
+        fixed: NDArray[np.integer] | None = None,
+        iterations: int,
+        device: str = "cpu",
+    ) -> None:
+        super().__init__(
+            vertices,
+            tetrahedra,
+            density=density,
+            youngs_modulus=youngs_modulus,
+            poisson_ratio=poisson_ratio,
+            gravity=gravity,
+            nodal_pressure=False,
+        )
+        if viscosity < 0 or friction < 0:
+            raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
+        if iterations < 1:
+            raise ValueError(f"iterations must be at least 1, not {iterations}")
+        newton = _newton()
+        self.viscosity, self.friction, self.floor = viscosity, friction, floor
+        self.iterations, self.device = iterations, device
+
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
+        if floor:
+            surface = newton.ModelBuilder.ShapeConfig(ke=FLOOR_STIFFNESS, kd=0.0, mu=friction)
+            builder.add_ground_plane(cfg=surface)
+        builder.add_soft_mesh(
+            pos=wp.vec3(0.0, 0.0, 0.0),
+            rot=wp.quat_identity(),
+            scale=1.0,
+            vel=wp.vec3(0.0, 0.0, 0.0),
+            vertices=self.vertices.tolist(),
+            indices=self.tetrahedra.ravel().tolist(),
+            density=density,
+            k_mu=self.mu,
+            k_lambda=self.lam,
+            k_damp=viscosity / 2,
+            add_surface_mesh_edges=False,
+            particle_radius=FLOOR_SKIN,
+        )
+        self._free = np.ones(self.nodes, dtype=bool)
+        if fixed is not None:
+            self._free[fixed] = False
+            for node in np.flatnonzero(~self._free):
+                builder.particle_mass[node] = 0.0
+        builder.color()
+        self._model = builder.finalize(device=device)
+        self._model.soft_contact_ke = FLOOR_STIFFNESS
+        self._model.soft_contact_kd = 0.0
+        self._model.soft_contact_mu = friction
+        self._solver = newton.solvers.SolverVBD(
+            self._model,
+            iterations=iterations,
+            friction_epsilon=FRICTION_SPEED,
+            particle_enable_self_contact=False,
+            particle_enable_tile_solve=False,
+            deterministic=wp.DeterministicMode.RUN_TO_RUN,
+        )
+        self._states = self._model.state(), self._model.state()
+        self._control = self._model.control()
+        self._contacts = None
+        if floor:
+            # Every node may touch the floor, always at the same height: found once, for all steps.
+            pipeline = newton.CollisionPipeline(self._model, soft_contact_gap=ANYWHERE)
+            self._contacts = pipeline.contacts()
+            pipeline.collide(self._states[0], self._contacts)
+
+    def run(
+        self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
+    ) -> Motion:
+        """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
+
+        Velocities are mean ones over a substep, so they lag half of one behind.
+
+        Args:
+            positions: [m], shape [nodes, 3].
+            velocities: [m/s], shape [nodes, 3].
+            frames: number of frames to compute.
+            frame_time: time between frames [s].
+            substeps: steps of implicit Euler per frame.
+
+        Raises:
+            SolverError: names the first frame whose positions are not finite.
+        """
+        substep = frame_time / substeps
+        path = np.empty((frames + 1, self.nodes, 3))
+        speeds = np.empty_like(path)
+        path[0] = positions
+        # With half a step of gravity taken back, free fall is exact.
+        speeds[0] = np.where(self._free[:, None], velocities, 0.0)
+        speeds[0, self._free, 2] += self.gravity * substep / 2
+        self._states[0].particle_q.assign(path[0].astype(np.float32))
+        self._states[0].particle_qd.assign(speeds[0].astype(np.float32))
+        parts = next(k for k in range(-(-substeps // CAPTURED), substeps + 1) if substeps % k == 0)
+        with wp.ScopedCapture(device=self.device) as capture:
+            self._advance(substeps // parts, substep)
+        for frame in range(1, frames + 1):
+            for _ in range(parts):
+                wp.capture_launch(capture.graph)
+            path[frame] = self._states[0].particle_q.numpy()
+            speeds[frame] = self._states[0].particle_qd.numpy()
+            if not np.isfinite(path[frame]).all():
+                raise SolverError(
+                    f"frame {frame}: positions are not finite; "
+                    f"{self.iterations} iterations in {substeps} substeps per frame are too few"
+                )
+        return Motion(path, speeds, lag=substep / 2)
+
+    def _advance(self, substeps: int, substep: float) -> None:
+        now, then = self._states
+        for _ in range(substeps):
+            self._solver.step(now, then, self._control, self._contacts, substep)
+            moved = self._solver.particle_displacements
+            inputs = [moved, substep, then.particle_qd]
+            wp.launch(_set_velocities, dim=self.nodes, inputs=inputs, device=self.device)
+            now, then = then, now
+        if now is not self._states[0]:
+            wp.copy(self._states[0].particle_q, now.particle_q)
+            wp.copy(self._states[0].particle_qd, now.particle_qd)
+
+
+@wp.kernel
+def _set_velocities(
+    displacements: wp.array(dtype=wp.vec3), substep: wp.float32, velocities: wp.array(dtype=wp.vec3)
+):
+    node = wp.tid()
+    velocities[node] = displacements[node] / substep
+
+
+def _newton() -> ModuleType:
+    if importlib.util.find_spec("newton") is None:
+        raise GeneratorError(
+            "the solver newton-vbd needs Newton, which is not installed: pip install 'm3gn-bench[newton]'"
+        )
+    import newton
+
+    logging.getLogger("newton").setLevel(logging.ERROR)
+    return newton
