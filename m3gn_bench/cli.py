@@ -258,6 +258,61 @@ def info(file: Path, as_json: bool) -> None:
 
 @cli.command()
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--split", default="test", show_default=True, help="train, validation or test.")
+@click.option("--index", type=int, default=0, show_default=True, help="Which trajectory of the split.")
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="A .png shows frames side by side, a .gif one after the other.",
+)
+@click.option(
+    "--frames",
+    default=None,
+    help="How many, evenly spaced, or a list such as 0,10,20.  [default: 6 in a .png, all in a .gif]",
+)
+@click.option("--fps", type=int, default=20, show_default=True, help="Of a .gif: frames per second.")
+@click.option(
+    "--colour",
+    default=None,
+    help="What colours show: displacement, height (displacement upwards) or area (over that at rest).  "
+    "[default: depends on the scene]",
+)
+@JSON
+def view(
+    file: Path,
+    split: str,
+    index: int,
+    output: Path,
+    frames: str | None,
+    fps: int,
+    colour: str | None,
+    as_json: bool,
+) -> None:
+    """Draw a trajectory of a dataset FILE, with matplotlib; no display is needed."""
+    from m3gn_bench.view import view as draw
+
+    report = Report(as_json)
+    with report.progress(f"drawing {output.name}") as on_progress:
+        viewed = draw(
+            file,
+            output,
+            split=split,
+            index=index,
+            frames=frames,
+            fps=fps,
+            colour=colour,
+            on_progress=on_progress,
+        )
+    report.finish(
+        {"file": str(output), "trajectory": viewed.trajectory, "frames": viewed.frames},
+        f"{output}: {viewed.trajectory}, {len(viewed.frames)} frames",
+    )
+
+
+@cli.command()
+@click.argument("file", type=click.Path(path_type=Path))
 @JSON
 def card(file: Path, as_json: bool) -> None:
     """Write the numbers of a dataset FILE into its scene's card, and record its hashes."""
