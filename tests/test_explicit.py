@@ -171,6 +171,7 @@ def test_beyond_the_stable_step_the_frame_is_named() -> None:
     ("change", "message"),
     [
         ({"poisson_ratio": 0.5}, "poisson_ratio"),
+        ({"poisson_ratio": -0.1}, "poisson_ratio"),
         ({"youngs_modulus": 0.0}, "youngs_modulus"),
         ({"density": 0.0}, "density"),
         ({"viscosity": -1.0}, "viscosity"),

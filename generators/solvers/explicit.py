@@ -36,7 +36,7 @@ class ExplicitSolid(TetrahedralSolid):
         tetrahedra: node indices, positively oriented, shape [cells, 4].
         density: [kg/m^3].
         youngs_modulus: [Pa].
-        poisson_ratio: nu in (-1, 0.5).
+        poisson_ratio: nu in [0, 0.5).
         viscosity: eta [Pa s].
         friction: Coulomb's coefficient of the floor.
         gravity: [m/s^2].

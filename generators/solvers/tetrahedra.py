@@ -18,10 +18,13 @@ Array = NDArray[np.float64]
 
 
 def lame_constants(youngs_modulus: float, poisson_ratio: float) -> tuple[float, float]:
-    """mu and lambda [Pa] of an isotropic solid. Raises ValueError outside E > 0, -1 < nu < 0.5."""
-    if not (youngs_modulus > 0 and -1 < poisson_ratio < 0.5):
+    """mu and lambda [Pa] of an isotropic solid. Raises ValueError outside E > 0, 0 <= nu < 0.5.
+
+    With nu < 0 this energy is lower at J = 0 than at rest, so an auxetic body would collapse.
+    """
+    if not (youngs_modulus > 0 and 0 <= poisson_ratio < 0.5):
         raise ValueError(
-            f"youngs_modulus must be positive and poisson_ratio in (-1, 0.5), not {youngs_modulus}, {poisson_ratio}"
+            f"youngs_modulus must be positive and poisson_ratio in [0, 0.5), not {youngs_modulus}, {poisson_ratio}"
         )
     mu = youngs_modulus / (2 * (1 + poisson_ratio))
     return mu, 2 * mu * poisson_ratio / (1 - 2 * poisson_ratio)
@@ -50,7 +53,7 @@ class TetrahedralSolid:
         tetrahedra: node indices, positively oriented, shape [cells, 4].
         density: [kg/m^3].
         youngs_modulus: [Pa].
-        poisson_ratio: nu in (-1, 0.5).
+        poisson_ratio: nu in [0, 0.5).
         gravity: [m/s^2].
         nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
 

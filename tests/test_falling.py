@@ -1,0 +1,120 @@
+"""Falling teddy and mixed objects: draws, flight, options, and the checks that guard the dataset."""
+
+import pickle
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.falling import (
+    FRAME_TIME,
+    GRAVITY,
+    HEIGHT,
+    POISSON_RATIOS,
+    YOUNGS_MODULI,
+    FallingTeddy,
+    MixedObjects,
+)
+from m3gn_bench.generators.generate import draw, generate
+from m3gn_bench.generators.objects import load_object, write_object
+from m3gn_bench.generators.scene import get_scene
+
+TEDDY = FallingTeddy()
+
+
+@pytest.fixture(scope="module")
+def fall() -> Trajectory:
+    """A soft teddy, quick to compute."""
+    parameters = draw(TEDDY, "test", 0, DATASET_SEED)
+    return TEDDY.simulate(replace(parameters, youngs_modulus=2e5, poisson_ratio=0.3), "fast")
+
+
+def test_draws_come_from_the_papers_grids() -> None:
+    draws = [draw(MixedObjects(), "train", index, DATASET_SEED) for index in range(60)]
+    assert all(d.youngs_modulus in YOUNGS_MODULI and d.poisson_ratio in POISSON_RATIOS for d in draws)
+    assert {d.object for d in draws[:6]} == set(MixedObjects.objects)
+    assert [d.object for d in draws[:54]] == [d.object for d in draws[6:]]
+    quaternions = np.array([d.orientation for d in draws])
+    assert np.linalg.norm(quaternions, axis=1) == pytest.approx(1)
+    assert len({d.orientation for d in draws}) == 60
+
+
+def test_it_falls_freely_until_it_touches_the_floor(fall: Trajectory) -> None:
+    start = fall.positions[0].astype(np.float64)
+    assert start[:, 2].min() == pytest.approx(HEIGHT, abs=1e-7)
+    landing = int(np.sqrt(2 * HEIGHT / GRAVITY) / FRAME_TIME)
+    times = FRAME_TIME * np.arange(landing + 1)
+    expected = start - np.array([0, 0, GRAVITY / 2]) * times[:, None, None] ** 2
+    assert np.abs(fall.positions[: landing + 1] - expected).max() < 1e-6
+    # One frame later the lowest node has met the floor, the highest has not noticed.
+    highest = start[:, 2].argmax()
+    fallen = start[highest, 2] - GRAVITY / 2 * (times[-1] + FRAME_TIME) ** 2
+    assert fall.positions[landing + 1, highest, 2] == pytest.approx(fallen, abs=1e-4)
+    assert fall.positions[landing + 1 :, :, 2].min(1).max() < 0.3
+
+
+def test_a_trajectory(fall: Trajectory) -> None:
+    assert fall.positions.shape == (201, 304, 3)
+    assert fall.mesh.cells.shape == (604, 3)
+    assert np.array_equal(fall.mesh.rest_positions, fall.positions[0])
+    assert fall.tags == {"object": "teddy"}
+    assert fall.material == {"youngs_modulus": 2e5, "poisson_ratio": 0.3}
+    assert TEDDY.check(fall) == []
+    assert 0 < fall.diagnostics["energy_left"] < 0.5
+    squashed = np.ptp(fall.positions[:, :, 2], axis=1).min()
+    assert squashed < 0.9 * np.ptp(fall.positions[0, :, 2])
+
+
+def test_the_same_draw_is_the_same_bit_for_bit(fall: Trajectory) -> None:
+    parameters = draw(TEDDY, "test", 0, DATASET_SEED)
+    again = FallingTeddy().simulate(replace(parameters, youngs_modulus=2e5, poisson_ratio=0.3), "fast")
+    assert again.content_hash() == fall.content_hash()
+
+
+def test_soft_and_stiff_are_told_apart() -> None:
+    parameters = draw(TEDDY, "test", 1, DATASET_SEED)
+    soft, stiff = (replace(parameters, youngs_modulus=e, poisson_ratio=0.3) for e in (1e5, 1e6))
+    one, other = (TEDDY.simulate(p, "fast").positions for p in (soft, stiff))
+    assert np.mean((one - other) ** 2) / TEDDY.scale_length**2 > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (lambda t: t.positions.__setitem__((80, 3, 1), np.nan), "not finite from frame 80"),
+        (lambda t: t.positions.__setitem__((90, 7, 2), -0.01), r"0.01 m below the floor in frame 90"),
+        (lambda t: t.diagnostics.update(energy_growth=0.02), "energy grows by 2.00%"),
+        (lambda t: t.diagnostics.update(inverted_tetrahedra_at_end=3), "3 tetrahedra are inverted"),
+        (lambda t: t.diagnostics.update(max_speed=100.0), "100.0 m/s"),
+    ],
+)
+def test_faults_are_found(fall: Trajectory, fault: object, reason: str) -> None:
+    spoilt = replace(fall, positions=fall.positions.copy(), diagnostics=dict(fall.diagnostics))
+    fault(spoilt)  # type: ignore[operator]
+    (problem,) = TEDDY.check(spoilt)
+    assert re.search(reason, problem)
+
+
+def test_a_users_own_object(tmp_path: Path) -> None:
+    """A scene with another object says so in its variant, and takes it to the workers as it is."""
+    path = tmp_path / "worm.npz"
+    write_object(replace(load_object("gummy_worm_2"), name="worm"), path)
+    scene = get_scene("falling_teddy", mesh=path)
+    (name,) = scene.variant.values()
+    assert name.startswith("worm-")
+    path.unlink()
+    sent = pickle.loads(pickle.dumps(scene))
+    assert sent.variant == scene.variant
+    report = generate(sent, "smoke", tmp_path, splits=["test"], fidelity="fast")
+    assert report.file.name == f"falling_teddy-smoke-{name}-test-fast.h5"
+    assert report.trajectories == 4
+
+
+def test_unknown_solver() -> None:
+    with pytest.raises(GeneratorError, match=r"unknown solver 'magic'; known: explicit, newton-vbd"):
+        get_scene("falling_teddy", solver="magic")

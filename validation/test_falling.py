@@ -1,0 +1,133 @@
+"""The falling scenes: error in time and in space, sensitivity to rounding, and materials beyond their range."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from m3gn_bench.datasets.recorded import TOLERANCE
+from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.falling import (
+    FRAME_TIME,
+    SIZE,
+    FallFidelity,
+    FallingTeddy,
+    FallParameters,
+    MixedObjects,
+)
+from m3gn_bench.generators.generate import draw
+
+TEDDY = FallingTeddy()
+IMPACT = 32  # first frame after contact
+LATER = IMPACT + 20  # 0.2 s after it
+
+
+def teddy(index: int = 0, **changes: float) -> FallParameters:
+    """A draw of the test split with some parameters changed."""
+    return replace(draw(TEDDY, "test", index, DATASET_SEED), **changes)
+
+
+def positions(parameters: FallParameters, courant: float, refinements: int = 0) -> np.ndarray:
+    """Recorded positions at a discretisation of one's own."""
+
+    class Scene(FallingTeddy):
+        fidelities = {"default": FallFidelity(refinements, courant)}
+
+    return Scene().simulate(parameters).positions.astype(np.float64)
+
+
+def distance(one: np.ndarray, other: np.ndarray, frame: int) -> float:
+    """Root mean square distance of the nodes over the object's size."""
+    return float(np.sqrt(((one[frame] - other[frame]) ** 2).sum(-1).mean())) / SIZE
+
+
+@pytest.mark.parametrize("poisson_ratio", [0.0, 0.3, 0.49, 0.499])
+def test_convergence_in_time(poisson_ratio: float) -> None:
+    """0.2 s after the impact the default step's error is below 0.5 % of the size, and falls with the step.
+
+    First order: the floor's impulse and the viscosity's lag, not leapfrog's second order, set the rate.
+    """
+    parameters = teddy(youngs_modulus=1e5 if poisson_ratio == 0.499 else 3e5, poisson_ratio=poisson_ratio)
+    finest = positions(parameters, 0.7 / 8)
+    errors = [distance(positions(parameters, 0.7 / k), finest, LATER) for k in (1, 2, 4)]
+    print(f"nu {poisson_ratio}: " + ", ".join(f"{error:.1e}" for error in errors))
+    assert errors[0] < 5e-3
+    # A step of 1/k against 1/8 of it: first order gives the ratios 7/3 and 3.
+    assert errors[0] > 1.8 * errors[1] > 1.8 * 2 * errors[2]
+
+
+def test_error_in_space_exceeds_that_in_time() -> None:
+    """Each tetrahedron cut into eight: this, not the step, limits the default level."""
+    parameters = teddy(youngs_modulus=2e5, poisson_ratio=0.3)
+    default = positions(parameters, 0.7)
+    space = distance(default, positions(parameters, 0.7, refinements=1), LATER)
+    time = distance(default, positions(parameters, 0.7 / 4), LATER)
+    print(f"in space {space:.1e}, in time {time:.1e}")
+    assert 5 * time < space < 0.2
+
+
+def test_rounding_is_harmless() -> None:
+    """The whole drop from a height that is 1e-12 m larger: what another processor's rounding can do at most."""
+    for index in range(3):
+        parameters = teddy(index)
+        one = TEDDY.simulate(parameters).positions.astype(np.float64)
+        other = TEDDY.simulate(replace(parameters, height=parameters.height + 1e-12)).positions
+        largest = np.abs(one - other).max() / TEDDY.scale_length
+        print(f"draw {index}: {largest:.1e}")
+        assert largest < TOLERANCE / 10
+
+
+EXTREMES = {
+    "softest, compressible": {"youngs_modulus": 1e5, "poisson_ratio": 0.0},
+    "softest, incompressible": {"youngs_modulus": 1e5, "poisson_ratio": 0.499},
+    "stiffest, compressible": {"youngs_modulus": 1e6, "poisson_ratio": 0.0},
+    "beyond: nu 0.4999": {"youngs_modulus": 2e5, "poisson_ratio": 0.4999},
+    "beyond: E / 10": {"youngs_modulus": 1e4, "poisson_ratio": 0.3},
+    "beyond: E x 10": {"youngs_modulus": 1e7, "poisson_ratio": 0.3},
+    "beyond: from 2 m": {"height": 2.0, "youngs_modulus": 3e5, "poisson_ratio": 0.3},
+    "beyond: from rest on the floor": {"height": 0.0, "youngs_modulus": 3e5, "poisson_ratio": 0.3},
+}
+
+
+def test_auxetic_material_is_refused() -> None:
+    """This law would let it collapse: at J = 0 its energy is below that at rest."""
+    with pytest.raises(ValueError, match="poisson_ratio"):
+        TEDDY.simulate(teddy(poisson_ratio=-0.9))
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes(name: str) -> None:
+    """Valid, or refused with a reason that a person can act on; never anything that is not finite."""
+    parameters = teddy(**EXTREMES[name])
+    try:
+        trajectory = TEDDY.simulate(parameters)
+    except SolverError as error:
+        assert name.startswith("beyond")
+        assert "frame" in str(error)
+        print(f"{name}: refused: {error}")
+        return
+    problems = TEDDY.check(trajectory)
+    print(f"{name}: {problems or 'valid'} {trajectory.diagnostics}")
+    assert np.isfinite(trajectory.positions).all()
+    assert trajectory.positions[..., 2].min() >= 0
+    if not name.startswith("beyond"):
+        assert problems == []
+
+
+def test_flat_on_an_edge_and_upside_down() -> None:
+    """Degenerate placements: the cone flat on its base, on an edge of it, on its tip."""
+    half = np.sqrt(0.5)
+    for quaternion in ((0, 0, 0, 1), (np.sin(0.2), 0, 0, np.cos(0.2)), (1, 0, 0, 0), (half, 0, 0, half)):
+        parameters = FallParameters("traffic_cone", tuple(map(float, quaternion)), 2e5, 0.45)
+        trajectory = MixedObjects().simulate(parameters)
+        assert MixedObjects().check(trajectory) == []
+
+
+def test_random_drops_are_valid() -> None:
+    """Nothing is rejected among the first draws of all objects."""
+    scene = MixedObjects()
+    for index in range(18):
+        trajectory = scene.simulate(draw(scene, "train", index, DATASET_SEED))
+        assert scene.check(trajectory) == []
+        assert len(trajectory.positions) * FRAME_TIME == pytest.approx(2.01)
