@@ -5,10 +5,13 @@ with their hashes (folder `meshes`), and a user's surface is meshed once, in the
 scene holds the body, and worker processes get it with the scene, node for node.
 """
 
+import importlib
+import io
 import json
 import zipfile
 import zlib
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -43,11 +46,12 @@ SURFACE_FORMATS = {
 }  # by trimesh; .npz is our own, meshio reads the rest
 
 # A user's surface: what to aim at, the better of which is kept.
-TARGETS = {"surface_nodes": (296, 304), "edge_factors": (1.1, 1.3), "envelopes": (0.005,)}
+TARGETS = {"surface_nodes": (304, 320), "edge_factors": (1.15,), "envelopes": (0.005,)}
 
 SMALLEST_CELL = 1e-12  # volume over the cube of the largest extent, below which a cell is flat
 SMALLEST_EXTENT = 1e-3  # over the largest
-VOLUME_ROUND_OFF = 1e-9
+SAME_PLACE = 1e-7  # over the largest extent
+SMALLEST_VOLUME = 1e-9  # over the cube of the largest extent, below which a surface encloses nothing
 
 # Red refinement: the edges' midpoints are the nodes 4..9 of a cell. Four cells keep a corner each; the
 # octahedron between them is cut along one of its diagonals, around which the other midpoints form a ring.
@@ -188,8 +192,6 @@ def read_object(path: Path) -> SoftBody:
 
 def _optional(library: str, path: Path) -> Any:
     """An optional library, imported for the sake of this file."""
-    import importlib
-
     try:
         return importlib.import_module(library)
     except ImportError as error:
@@ -215,35 +217,35 @@ def _read_surface(path: Path) -> tuple[Floats, Indices]:
     triangles = getattr(mesh, "faces", None)
     if triangles is None or not len(triangles):
         raise GeneratorError(f"{path} holds no triangles; export it as a surface mesh, not as a point cloud")
-    _require_finite(path, mesh.vertices)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a file of separate triangles becomes a surface
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(triangles, np.int32)
 
 
 def _read_cells(path: Path) -> tuple[Floats, dict[str, Indices]]:
-    """Vertices, and the tetrahedra or, where there are none, the triangles."""
+    """Vertices, and the cells by kind, among them tetrahedra or triangles."""
     meshio = _optional("meshio", path)
     mesh = _parsed(path, lambda: meshio.read(path))
     cells = {kind: np.asarray(block, np.int32) for kind, block in mesh.cells_dict.items() if len(block)}
-    foreign = sorted(
-        kind for kind in cells if kind.startswith(("tetra1", "hexa", "wedge", "pyramid", "quad", "triangle6"))
-    )
-    solid = [kind for kind in foreign if not kind.startswith(("quad", "triangle"))]
-    if solid or (foreign and not cells.keys() & {"tetra", "triangle"}):
-        raise GeneratorError(f"{path} holds {', '.join(foreign)}; export linear tetrahedra (4 nodes) only")
+    foreign = cells.keys() - {"vertex", "line", "triangle", "tetra"}
+    if foreign:
+        raise GeneratorError(
+            f"{path} holds cells of kind {', '.join(sorted(foreign))}; export linear tetrahedra or triangles only"
+        )
     if not cells.keys() & {"tetra", "triangle"}:
         raise GeneratorError(f"{path} holds neither tetrahedra nor triangles; export the mesh with its cells")
     return np.asarray(mesh.points, np.float64), cells
 
 
 def _parsed(path: Path, read: Callable[[], Any]) -> Any:
-    """What another library makes of the file; whatever it raises (meshio exits) means that it cannot."""
+    """What another library makes of the file. Whatever it raises means that it cannot; meshio prints and exits."""
+    printed = io.StringIO()
     try:
-        return read()
+        with redirect_stdout(printed), redirect_stderr(printed):
+            return read()
     except (Exception, SystemExit) as error:
+        reason = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else str(error)
         raise GeneratorError(
-            f"{path} cannot be read as {path.suffix or 'a mesh'}: {error}; is the file whole, and does its "
-            "name end as its format wants?"
+            f"{path} cannot be read: {reason or type(error).__name__}; is the file whole, and does its name end as "
+            "its format wants?"
         ) from error
 
 
@@ -295,8 +297,7 @@ def _from_tetrahedra(path: Path, vertices: Floats, tetrahedra: Indices) -> SoftB
             "the same place"
         )
     surface = boundary_triangles(tetrahedra)
-    total = volumes.sum()
-    if not is_closed(surface) or abs(enclosed_volume(vertices, surface) - total) > VOLUME_ROUND_OFF * total:
+    if not (is_closed(surface) and is_consistently_wound(surface)):
         raise GeneratorError(
             f"{path}: tetrahedra overlap or touch in an edge only; mesh the object again, or give its surface "
             "as .stl"
@@ -313,8 +314,7 @@ def _from_tetrahedra(path: Path, vertices: Floats, tetrahedra: Indices) -> SoftB
 def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
     """The body inside a user's surface, checked, remeshed and filled with tetrahedra."""
     _require_shape(path, vertices, triangles, "triangles")
-    corners = np.sort(triangles, axis=1)
-    triangles = triangles[(corners[:, 1:] != corners[:, :-1]).all(1)]  # without those that are only an edge
+    vertices, triangles = _merged(vertices, triangles)
     if not is_closed(triangles):
         raise GeneratorError(
             f"{path}: the surface is not closed (some edges do not belong to exactly two triangles); fill the "
@@ -329,15 +329,13 @@ def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
         )
     volume = enclosed_volume(vertices, triangles)
     if volume < 0:
-        triangles = triangles[:, ::-1]
-    if abs(volume) <= VOLUME_ROUND_OFF * np.ptp(vertices, axis=0).max() ** 3:
+        triangles = triangles[:, ::-1].copy()
+    if abs(volume) <= SMALLEST_VOLUME:
         raise GeneratorError(f"{path}: the surface encloses no volume; give the surface of a solid body")
     for library in ("pyvista", "pyacvd", "pytetwild"):
         _optional(library, path)
     from m3gn_bench.generators.meshes.remeshing import candidates, recipes
 
-    used, places = np.unique(triangles, return_inverse=True)
-    vertices, triangles = vertices[used], places.reshape(-1, 3).astype(np.int32)
     usable = [
         candidate
         for candidate in candidates(vertices, triangles, recipes(**TARGETS))
@@ -350,3 +348,16 @@ def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
         )
     best = max(usable, key=lambda candidate: candidate.stable_step)
     return SoftBody(path.stem, best.vertices, best.tetrahedra, best.surface_nodes)
+
+
+def _merged(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
+    """The surface with one node at each place, in units of its extent, without unused nodes and without
+    triangles that are but an edge: a file of separate triangles becomes a surface."""
+    corners = vertices[triangles].reshape(-1, 3)
+    corners = (corners - corners.min(0)) / np.ptp(corners, axis=0).max()
+    _, first, places = np.unique(
+        np.round(corners / SAME_PLACE), axis=0, return_index=True, return_inverse=True
+    )
+    merged = places.reshape(-1, 3).astype(np.int32)
+    ordered = np.sort(merged, axis=1)
+    return corners[first], merged[(ordered[:, 1:] != ordered[:, :-1]).all(1)]

@@ -52,16 +52,16 @@ def teddy(points: Array) -> Array:
     parts = [
         ellipsoid(points, (0, 0, 0.34), (0.26, 0.23, 0.30)),  # body
         ellipsoid(points, (0, -0.02, 0.76), (0.24, 0.21, 0.20)),  # head
-        ellipsoid(points, (0, -0.21, 0.71), (0.11, 0.10, 0.085)),  # muzzle
+        ellipsoid(points, (0, -0.23, 0.70), (0.115, 0.11, 0.09)),  # muzzle
     ]
     for side in (-1, 1):
         parts += [
-            ellipsoid(points, (side * 0.21, 0, 0.93), (0.105, 0.065, 0.105)),  # ear
+            ellipsoid(points, (side * 0.235, 0, 0.965), (0.125, 0.075, 0.125)),  # ear
             capsule(points, (side * 0.20, -0.04, 0.54), (side * 0.38, -0.16, 0.40), 0.085, 0.095),  # arm
             capsule(points, (side * 0.13, -0.05, 0.13), (side * 0.24, -0.36, 0.12), 0.11, 0.115),  # leg
             ellipsoid(points, (side * 0.25, -0.40, 0.15), (0.115, 0.085, 0.14)),  # foot
         ]
-    return smooth_union(parts, 0.035)
+    return smooth_union(parts, 0.025)
 
 
 def bunny(points: Array) -> Array:
@@ -71,11 +71,11 @@ def bunny(points: Array) -> Array:
         ellipsoid(points, (0, -0.06, 0.30), (0.15, 0.15, 0.27)),  # chest
         ellipsoid(points, (0, -0.13, 0.60), (0.15, 0.17, 0.14)),  # head
         ellipsoid(points, (0, -0.27, 0.57), (0.075, 0.06, 0.06)),  # snout
-        ellipsoid(points, (0, 0.33, 0.17), (0.085, 0.085, 0.085)),  # tail
+        ellipsoid(points, (0, 0.34, 0.17), (0.10, 0.10, 0.10)),  # tail
     ]
     for side in (-1, 1):
         parts += [
-            capsule(points, (side * 0.06, -0.08, 0.70), (side * 0.13, -0.01, 0.99), 0.052, 0.07),  # ear
+            capsule(points, (side * 0.06, -0.08, 0.70), (side * 0.14, -0.01, 0.98), 0.055, 0.08),  # ear
             ellipsoid(points, (side * 0.17, 0.04, 0.17), (0.09, 0.17, 0.16)),  # haunch
             capsule(
                 points, (side * 0.17, 0.02, 0.065), (side * 0.205, -0.09, 0.065), 0.065, 0.065
@@ -90,11 +90,11 @@ def gummy_bear(points: Array) -> Array:
     parts = [
         ellipsoid(points, (0, 0, 0.38), (0.24, 0.19, 0.32)),  # body
         ellipsoid(points, (0, -0.02, 0.77), (0.19, 0.17, 0.17)),  # head
-        ellipsoid(points, (0, -0.18, 0.74), (0.09, 0.08, 0.07)),  # snout
+        ellipsoid(points, (0, -0.19, 0.73), (0.10, 0.10, 0.08)),  # snout
     ]
     for side in (-1, 1):
         parts += [
-            ellipsoid(points, (side * 0.15, -0.01, 0.91), (0.085, 0.06, 0.085)),  # ear
+            ellipsoid(points, (side * 0.175, -0.01, 0.935), (0.105, 0.08, 0.105)),  # ear
             capsule(points, (side * 0.18, -0.06, 0.54), (side * 0.17, -0.22, 0.47), 0.085, 0.085),  # arm
             capsule(points, (side * 0.13, -0.02, 0.14), (side * 0.14, -0.19, 0.10), 0.125, 0.11),  # leg
         ]
@@ -105,7 +105,7 @@ def _worm(points: Array, curve: Array, ridges: int) -> Array:
     """A tube around a curve [stations, 3] whose radius swells `ridges` times and tapers towards both ends."""
     arc = np.linspace(0, 1, len(curve))
     taper = 0.8 + 0.2 * np.clip(np.minimum(arc, 1 - arc) / 0.08, 0, 1)
-    radii = 0.085 * taper * (1 - 0.16 * np.cos(2 * np.pi * ridges * arc))
+    radii = 0.09 * taper * (1 - 0.24 * np.cos(2 * np.pi * ridges * arc))
     tube = [
         capsule(points, start, end, radius, end_radius)
         for start, end, radius, end_radius in zip(curve, curve[1:], radii, radii[1:], strict=False)
@@ -117,19 +117,19 @@ def gummy_worm_1(points: Array) -> Array:
     """A ridged worm lying in the shape of an S."""
     arc = np.linspace(-1, 1, 81)
     curve = np.c_[0.42 * arc, 0.15 * np.sin(np.pi * arc), np.full_like(arc, 0.5)]
-    return _worm(points, curve, ridges=7)
+    return _worm(points, curve, ridges=6)
 
 
 def gummy_worm_2(points: Array) -> Array:
     """A ridged worm bent to a C, one end lifted above the other."""
     angle = np.linspace(-0.68, 0.68, 81) * np.pi
     curve = np.c_[0.34 * np.sin(angle), 0.34 * np.cos(angle), 0.5 + 0.10 * angle / np.pi]
-    return _worm(points, curve, ridges=8)
+    return _worm(points, curve, ridges=7)
 
 
 def traffic_cone(points: Array) -> Array:
     """A traffic cone: a round, blunt cone on a square plate with rounded corners."""
-    plate = rounded_box(points, (0, 0, 0.05), (0.33, 0.33, 0.05), 0.03)
+    plate = rounded_box(points, (0, 0, 0.06), (0.32, 0.32, 0.06), 0.02)
     cone = capsule(points, (0, 0, 0.05), (0, 0, 0.92), 0.225, 0.075)
     return np.maximum(
         smooth_union([plate, cone], 0.03), -points[..., 2]
