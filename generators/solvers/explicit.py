@@ -149,18 +149,6 @@ class ExplicitSolid(TetrahedralSolid):
     def run(
         self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
     ) -> Motion:
-        """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
-
-        Args:
-            positions: [m], shape [nodes, 3].
-            velocities: [m/s], shape [nodes, 3].
-            frames: number of frames to compute.
-            frame_time: time between frames [s].
-            substeps: leapfrog steps per frame.
-
-        Raises:
-            SolverError: names the first frame whose positions are not finite.
-        """
         substep = frame_time / substeps
         parts = next(k for k in range(max(1, substeps // CAPTURED), 0, -1) if substeps % k == 0)
         path = np.empty((frames + 1, self.nodes, 3))

@@ -89,6 +89,23 @@ class TetrahedralSolid:
         self.nodal_volumes = self.gather(np.repeat(self.volumes / 4, 4))
         self.masses = density * self.nodal_volumes
 
+    def run(
+        self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
+    ) -> Motion:
+        """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
+
+        Args:
+            positions: [m], shape [nodes, 3].
+            velocities: [m/s], shape [nodes, 3].
+            frames: number of frames to compute.
+            frame_time: time between frames [s].
+            substeps: of the solver, per frame.
+
+        Raises:
+            SolverError: names the first frame whose positions are not finite.
+        """
+        raise NotImplementedError
+
     def gather(self, corner_values: Array) -> Array:
         """Sum values of the cells' corners [cells * 4] at the nodes [nodes]."""
         return np.asarray(np.bincount(self.tetrahedra.ravel(), corner_values, self.nodes))
