@@ -40,6 +40,7 @@ SCALE = 1.6  # width of what shows the scale, in the corner below [inch]
 MARGIN = 0.05  # around the motion, of its larger extent
 LEAST_WIDTH = 6.0  # [inch], for the heading
 PALETTE_FRAMES = 8
+LEAST_AREA_CHANGE = 1e-3  # on the colour bar; below is the round-off of float32
 
 LIGHT = np.array([-0.45, 0.5, 0.74])  # right, up, towards the camera; of length 1
 AMBIENT = 0.6
@@ -211,7 +212,7 @@ class Picture:
             rest = triangle_areas(self.mesh.rest_positions.astype(np.float64), self.faces)
             values = triangle_areas(self.positions, self.faces) / np.maximum(rest, np.finfo(float).tiny)
             # A few crumpled triangles would leave no colour for the others.
-            reach = float(np.quantile(np.abs(values - 1), 0.998)) or 1.0
+            reach = max(float(np.quantile(np.abs(values - 1), 0.998)), LEAST_AREA_CHANGE)
             return values, Normalize(1 - reach, 1 + reach), colormaps["coolwarm"], "area / area at rest"
         if colour == "height":
             values = moved[..., -1][:, self.faces].mean(-1)
@@ -225,8 +226,8 @@ class Picture:
     def _floor(self, height: float) -> Floor:
         """A floor below the whole motion."""
         lower, upper = self.positions.min((0, 1))[:2], self.positions.max((0, 1))[:2]
-        step = round_length((upper - lower).max() / 4)
-        first, last = np.floor(lower / step - 0.2), np.ceil(upper / step + 0.2)
+        step = round_length((float((upper - lower).max()) or 1.0) / 4)
+        first, last = np.floor(lower / step) - 1, np.ceil(upper / step) + 1
         x, y = (step * np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
         along_y = [[(value, y[0], height), (value, y[-1], height)] for value in x]
         along_x = [[(x[0], value, height), (x[-1], value, height)] for value in y]
@@ -447,8 +448,8 @@ class Picture:
             for way in path[: frame + 1].swapaxes(0, 1):
                 panel.plot(*way.T, color=GRIP, lw=1.2, zorder=4)
                 panel.plot(*way[0], marker="o", ms=4, mfc="white", mec=GRIP, zorder=4)
-                if np.ptp(way, axis=0).any():
-                    before, now = way[-2], way[-1]
+                before, now = way[max(0, frame - 1)], way[-1]
+                if (now != before).any():
                     head = {"arrowstyle": "-|>", "color": GRIP, "shrinkA": 0, "shrinkB": 0}
                     panel.annotate(
                         "", xy=(now[0], now[1]), xytext=(before[0], before[1]), arrowprops=head, zorder=4
@@ -463,6 +464,8 @@ def _palette(pixels: NDArray[np.uint8]) -> Image.Image:
     red, green, blue = pixels.astype(np.int32).T
     different = np.unique(red << 16 | green << 8 | blue)  # far faster than unique rows
     channels = np.stack([different >> 16, different >> 8 & 255, different & 255], -1).astype(np.uint8)
+    # Pillow looks colours up in steps of four levels, so an entry next to white would take white's place.
+    channels = channels[channels.min(1) < 248]
     colours = Image.fromarray(channels[None]).quantize(255, kmeans=1).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([255, 255, 255, *colours])

@@ -95,7 +95,7 @@ def view(
     try:
         from m3gn_bench.picture import Picture
     except ImportError as error:
-        raise ConfigError("pictures need matplotlib; pip install 'm3gn-bench[plot]'") from error
+        raise ConfigError(f"pictures need matplotlib ({error}); pip install 'm3gn-bench[plot]'") from error
 
     with open_file(file) as opened:
         metadata = read_metadata(opened)
@@ -115,7 +115,8 @@ def view(
 
 def _find(file: Path, keys: list[str], split: str, index: int) -> str:
     """The key of a trajectory. Raises DatasetError with what there is instead."""
-    count = sum(parse_key(key)[0] == as_split(split) for key in keys)
+    wanted = as_split(split)
+    count = sum(parse_key(key)[0] == wanted for key in keys)
     if not count:
         present = sorted({parse_key(key)[0] for key in keys})
         raise DatasetError(f"{file} has no {split} trajectories; it has {' and '.join(present) or 'none'}")

@@ -1,0 +1,374 @@
+"""Pictures of trajectories: the right things at the right places, and clear errors."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import TetraWriter
+
+pytest.importorskip("matplotlib")
+from PIL import Image
+
+from m3gn_bench import picture
+from m3gn_bench.cli import run
+from m3gn_bench.datasets.schema import Metadata
+from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TETRA, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.generators.scene import scene_names
+from m3gn_bench.picture import Camera, Picture
+from m3gn_bench.view import LOOKS, Look, select_frames
+
+FRAMES = 4
+DPI = picture.STILL_DPI
+SQUARE = np.array([[0, 1, 3], [0, 3, 2]], np.int32)  # of four nodes, row by row
+OCTAHEDRON = np.array(
+    [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]], np.int32
+)
+
+
+def block() -> Trajectory:
+    """A square whose top is pressed down by a circle of radius 20 that comes from above."""
+    rest = np.array([[-50, -100], [50, -100], [-50, 0], [50, 0]], np.float32)
+    positions = np.repeat(rest[None], FRAMES, axis=0)
+    positions[:, 2:, 1] -= 10 * np.arange(FRAMES)[:, None]
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    circle = 20 * np.column_stack([np.cos(angles), np.sin(angles)])
+    centres = [[10, 30 - 10 * frame] for frame in range(FRAMES)]
+    nodes = np.arange(40)
+    return Trajectory(
+        positions=positions,
+        mesh=Mesh(rest, SQUARE, VTK_TRIANGLE, np.array([FIXED, FIXED, FREE, FREE], np.uint8)),
+        material={"poisson_ratio": -0.9},
+        collider_positions=np.array([circle + centre for centre in centres], np.float32),
+        collider_edges=np.column_stack([nodes, np.roll(nodes, -1)]).astype(np.int32),
+    )
+
+
+def ball() -> Trajectory:
+    """An octahedron that falls onto the floor, where it is flattened."""
+    rest = 0.25 * np.concatenate([sign * np.eye(3)[[axis]] for axis in range(3) for sign in (1, -1)])
+    heights = [1.0, 0.75, 0.5, 0.2]
+    positions = np.array([rest * (1, 1, min(1, 4 * height)) + (0, 0, height) for height in heights])
+    return Trajectory(
+        positions=positions.astype(np.float32),
+        mesh=Mesh(rest.astype(np.float32), OCTAHEDRON, VTK_TRIANGLE, np.zeros(6, np.uint8)),
+        material={"youngs_modulus": 3.2e5, "poisson_ratio": 0.49},
+        tags={"object": "octahedron"},
+    )
+
+
+def metadata_of(tetra_metadata: Metadata, scene: str, dimension: int) -> Metadata:
+    """Metadata under a scene's name, whose look is then used."""
+    units = {"youngs_modulus": "Pa", "poisson_ratio": ""}
+    changes = {"scene": scene, "material_units": units, "load_units": {}, "scale_centre": (0.0,) * dimension}
+    return tetra_metadata.model_copy(update=changes)
+
+
+@pytest.fixture(scope="module")
+def files(
+    tmp_path_factory: pytest.TempPathFactory, write_tetra: TetraWriter, tetra_metadata: Metadata
+) -> dict[str, Path]:
+    """A dataset file of each kind: in the plane, in space with a floor, tetrahedra, not a number."""
+    folder = tmp_path_factory.mktemp("view")
+    few = {"test_00000", "test_00001"}
+    broken = block()
+    broken.positions[1, 2, 0] = np.nan
+    flat, solid = (
+        metadata_of(tetra_metadata, *scene) for scene in (("deformable_block", 2), ("mixed_objects", 3))
+    )
+    return {
+        "block": write_tetra(folder / "block.h5", change=lambda *_: block(), metadata=flat, only=few),
+        "ball": write_tetra(folder / "ball.h5", change=lambda *_: ball(), metadata=solid, only=few),
+        "tetra": write_tetra(folder / "tetra.h5", only=few),
+        "nan": write_tetra(folder / "nan.h5", change=lambda *_: broken, metadata=flat, only=few),
+    }
+
+
+def view(*arguments: object) -> int:
+    """Exit code of the command."""
+    with pytest.raises(SystemExit) as stop:
+        run(["view", *(str(argument) for argument in arguments)])
+    return int(stop.value.code or 0)
+
+
+def pixels(image: Image.Image) -> np.ndarray:
+    """Shape [rows, columns, 3], integers."""
+    return np.asarray(image.convert("RGB")).astype(int)
+
+
+def near(image: np.ndarray, colour: str, tolerance: int = 2) -> np.ndarray:
+    """Where the image has a colour, shape [rows, columns]."""
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return (np.abs(image - wanted) <= tolerance).all(-1)
+
+
+def draw(trajectory: Trajectory, metadata: Metadata, look: Look, frames: list[int]) -> np.ndarray:
+    """A still."""
+    content = Picture(trajectory, metadata, look, look.colour, "title").still(frames)
+    return pixels(Image.open(io.BytesIO(content)))
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["block", "ball", "tetra"])
+def test_still(files: dict[str, Path], tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new folder" / "x.png"
+    assert view(files[kind], "--index", 1, "-o", out, "--frames", "0,3", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record == {"file": str(out), "trajectory": "test_00001", "frames": [0, 3]}
+    assert [path.name for path in out.parent.iterdir()] == ["x.png"]
+    image = pixels(Image.open(out))
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
+    assert near(image, "#ffffff").mean() < 0.97
+
+
+@pytest.mark.parametrize(("kind", "frames"), [("block", None), ("ball", "3")])
+def test_animation(files: dict[str, Path], tmp_path: Path, kind: str, frames: str | None) -> None:
+    out = tmp_path / "x.gif"
+    wanted = [] if frames is None else ["--frames", frames]
+    assert view(files[kind], "--split", "test", "-o", out, "--fps", 10, *wanted) == 0
+    with Image.open(out) as movie:
+        assert (movie.n_frames, movie.info["duration"], movie.info["loop"]) == (int(frames or FRAMES), 100, 0)
+        first = pixels(movie)
+        movie.seek(movie.n_frames - 1)
+        last = pixels(movie)
+    assert (first[0, 0] == 255).all()  # the palette has kept white
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 30
+    changed = (first != last).any(-1)
+    assert 0.01 < changed.mean() < 0.7
+    assert not changed[: len(changed) // 20].any()  # the heading stays
+
+
+def test_without_a_display(files: dict[str, Path], tmp_path: Path) -> None:
+    """In a process of its own, as if on a server, and with a backend that cannot work there."""
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("DISPLAY")}
+    command = [sys.executable, "-c", "from m3gn_bench.cli import run; run()"]
+    arguments = ["view", str(files["tetra"]), "-o", "x.png", "--frames", "1"]
+    subprocess.run(
+        [*command, *arguments], cwd=tmp_path, env=environment | {"MPLBACKEND": "tkagg"}, check=True
+    )
+    image = pixels(Image.open(tmp_path / "x.png"))
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
+
+
+# --- what is in the picture -------------------------------------------------------------------------------
+
+
+def test_circle_is_round_and_where_it_belongs(tetra_metadata: Metadata) -> None:
+    metadata, look = metadata_of(tetra_metadata, "deformable_block", 2), LOOKS["deformable_block"]
+    image = draw(block(), metadata, look, [2])
+    legend = int(len(image) - DPI * picture.FOOT)
+    rows, columns = np.nonzero(near(image[:legend], picture.COLLIDER))
+    unit = DPI * picture.STILL_PANEL / (150 * 1.1)  # pixels; the motion spans 150, from y = -100 to 50
+    assert np.ptp(rows) == pytest.approx(40 * unit, abs=5)
+    assert np.ptp(columns) == pytest.approx(40 * unit, abs=5)
+    # Frame 2 has its centre at y = 10, so 40 below the top of the motion.
+    top = DPI * (picture.HEAD + picture.TITLE) + 0.05 * 150 * unit
+    assert rows.mean() == pytest.approx(top + 40 * unit, abs=3)
+
+
+def test_ball_falls_at_one_scale(tetra_metadata: Metadata) -> None:
+    metadata, look = metadata_of(tetra_metadata, "mixed_objects", 3), LOOKS["mixed_objects"]
+    heights, sizes = [], []
+    for frame in range(3):
+        image = draw(ball(), metadata, look, [frame])
+        panel = image[int(DPI * (picture.HEAD + picture.TITLE)) : int(len(image) - DPI * picture.FOOT)]
+        assert near(panel, picture.FLOOR).mean() > 0.005
+        assert near(panel, picture.SHADOW).mean() > 0.005
+        grey = (np.ptp(panel, axis=-1) < 12) & (panel.max(-1) > 100) & (panel.max(-1) < 215)
+        rows = np.nonzero(grey & ~near(panel, picture.SHADOW) & ~near(panel, picture.FLOOR_LINE))[0]
+        heights.append(float(np.median(rows)))
+        sizes.append(len(rows))
+    assert sizes[1:] == pytest.approx(sizes[:1] * 2, rel=0.05)
+    fall = DPI * picture.STILL_PANEL / 1.5 * 0.25  # 0.25 from frame to frame, in a panel about 1.5 high
+    assert np.diff(heights) == pytest.approx([fall, fall], rel=0.15)
+
+
+def test_near_triangles_hide_far_ones(tetra_metadata: Metadata) -> None:
+    look = Look(azimuth=30.0, elevation=25.0)
+    right, up, towards = Camera(3, look.azimuth, look.elevation).axes
+    triangle = np.array([-right - up, right - up, up])
+    metadata = metadata_of(tetra_metadata, "unknown", 3)
+
+    def middle(order: list[int]) -> np.ndarray:
+        rest = np.concatenate([triangle - towards, triangle + towards]).astype(np.float32)
+        moved = rest.copy()
+        moved[3:] += (0.2 * towards).astype(np.float32)  # the nearer one moves, and gets the last colour
+        cells = np.array([[0, 1, 2], [3, 4, 5]], np.int32)[order]
+        mesh = Mesh(rest, cells, VTK_TRIANGLE, np.zeros(6, np.uint8))
+        image = draw(Trajectory(np.array([rest, moved]), mesh, {}), metadata, look, [1])
+        across = (picture.LEAST_WIDTH - picture.BAR) / 2
+        return image[int(DPI * (picture.HEAD + picture.TITLE + picture.STILL_PANEL / 2)), int(DPI * across)]
+
+    assert (middle([0, 1]) == middle([1, 0])).all()
+    red, _, blue = middle([0, 1])
+    assert blue > red + 30  # dark blue, not the pale yellow of the triangle behind
+
+
+def test_colours_have_the_right_numbers(tetra_metadata: Metadata) -> None:
+    def values(colour: str, trajectory: Trajectory, scene: str) -> tuple[np.ndarray, float, float]:
+        metadata = metadata_of(tetra_metadata, scene, trajectory.positions.shape[-1])
+        made = Picture(trajectory, metadata, Look(), colour, "")  # type: ignore[arg-type]
+        assert made.norm.vmin is not None
+        assert made.norm.vmax is not None
+        return made.values[-1], made.norm.vmin, made.norm.vmax
+
+    shown, low, high = values("displacement", block(), "deformable_block")
+    assert shown == pytest.approx([10, 20])  # one and two of three corners have moved by 30
+    assert (low, high) == (0, pytest.approx(20))
+    shown, low, high = values("height", block(), "deformable_block")
+    assert shown == pytest.approx([-10, -20])
+    assert (low, high) == (pytest.approx(-20), pytest.approx(20))
+    shown, low, high = values("area", block(), "deformable_block")
+    assert shown == pytest.approx([0.7, 0.7])
+    assert (low, high) == (pytest.approx(0.7), pytest.approx(1.3))
+    # An octahedron's face, flattened by the factor 0.8: sqrt(1 + 2 * 0.8^2) / sqrt(3).
+    assert values("area", ball(), "mixed_objects")[0] == pytest.approx(np.full(8, np.sqrt(2.28 / 3)))
+
+
+# --- geometry ---------------------------------------------------------------------------------------------
+
+
+def test_surface_of_tetrahedra() -> None:
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], np.float32)
+    cells = np.array([[0, 1, 2, 3], [1, 2, 3, 4]], np.int32)
+    faces = picture.surface(Mesh(rest, cells, VTK_TETRA, np.zeros(5, np.uint8)))
+    assert len(faces) == 6
+    assert {1, 2, 3} not in [set(face) for face in faces.tolist()]
+    assert len(picture.outline(faces)) == 0
+    a, b, c = rest[faces].swapaxes(0, 1)
+    assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(1 / 6 + 1 / 3)  # outwards: the volume is positive
+
+
+def test_outline_and_rings() -> None:
+    assert {frozenset(edge) for edge in picture.outline(SQUARE).tolist()} == {
+        frozenset(edge) for edge in ((0, 1), (1, 3), (3, 2), (2, 0))
+    }
+    two = np.array([[0, 1], [1, 2], [2, 0], [3, 5], [5, 4], [4, 6], [6, 3], [0, 1]])
+    assert [sorted(ring) for ring in picture.rings(two)] == [[0, 1, 2], [3, 4, 5, 6]]
+    (_, square) = picture.rings(two)
+    assert square in ([3, 5, 4, 6], [3, 6, 4, 5])
+    assert picture.rings(np.array([[0, 1], [1, 2]])) == []
+
+
+def test_camera_keeps_lengths() -> None:
+    camera = Camera(3, azimuth=-37.0, elevation=21.0)
+    assert camera.axes @ camera.axes.T == pytest.approx(np.eye(3))
+    assert np.linalg.det(camera.axes) == pytest.approx(1)
+    assert camera(np.array([0, 0, 1.0])) == pytest.approx([0, np.cos(np.deg2rad(21))])  # z is up
+    assert (Camera(2, -37.0, 21.0)(np.array([[1.0, 2.0]])) == [[1, 2]]).all()
+
+
+@pytest.mark.parametrize(("length", "expected"), [(1.0, 1.0), (0.7, 0.5), (49.9, 20.0), (3e-4, 2e-4)])
+def test_round_length(length: float, expected: float) -> None:
+    assert picture.round_length(length) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (None, [0, 10, 20, 30, 40, 50]),
+        ("3", [0, 25, 50]),
+        ("1", [0]),
+        ("51", list(range(51))),
+        ("5,7", [5, 7]),
+        ("7,", [7]),
+        ("50, 0", [50, 0]),
+    ],
+)
+def test_select_frames(text: str | None, expected: list[int]) -> None:
+    assert select_frames(text, 51, 6) == expected
+
+
+def test_fewer_frames_than_usual() -> None:
+    assert select_frames(None, 4, 6) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("text", ["", ",", "a", "0", "52", "-1", "51,", "0,-1", "1.5", "1,,2"])
+def test_frames_that_make_no_sense(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"frame"):
+        select_frames(text, 51, 6)
+
+
+def test_every_scene_has_a_look() -> None:
+    from m3gn_bench.generators import deformable_block
+
+    assert set(LOOKS) == set(scene_names())
+    assert LOOKS["deformable_block"].floor == deformable_block.BASE
+
+
+# --- errors -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        ("block", ["-o", "x.mp4"], "x.mp4 must end in .png (a still) or in .gif (an animation)"),
+        ("block", ["-o", "x"], "must end in .png"),
+        ("block", ["-o", "x.png", "--index", "2"], "index 2 is out of range: {} has 2 test trajectories, 0 to 1"),
+        ("block", ["-o", "x.png", "--index", "-1"], "index -1 is out of range"),
+        ("block", ["-o", "x.png", "--split", "dev"], "unknown split 'dev'; known: test, train, validation"),
+        ("block", ["-o", "x.png", "--split", "train"], "{} has no train trajectories; it has test"),
+        ("block", ["-o", "x.gif", "--frames", "0,4"], "frame 4 is out of range: the trajectory has frames 0 to 3"),
+        ("block", ["-o", "x.png", "--frames", "5"], "5 frames are out of range: the trajectory has 4"),
+        ("block", ["-o", "x.png", "--frames", "all"], "'all' is neither a number of frames"),
+        ("block", ["-o", "x.gif", "--fps", "0"], "0 frames per second are out of range: 1 to 50"),
+        ("block", ["-o", "x.png", "--colour", "red"], "unknown colour 'red'; known: area, displacement, height"),
+        ("block", [], "Missing option '--output'"),
+        ("nan", ["-o", "x.png"], "trajectory test_00000 cannot be drawn; 'm3gn-bench validate'"),
+        ("absent", ["-o", "x.png"], "no dataset file at {}"),
+    ],
+)  # fmt: skip
+def test_errors(
+    files: dict[str, Path],
+    kind: str,
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = files.get(kind, Path("absent.h5"))
+    assert view(file, *arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.splitlines()[-1].lower().startswith("error: ")
+    assert message.format(file) in shown.err.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_library(
+    files: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delitem(sys.modules, "m3gn_bench.picture")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert view(files["block"], "-o", tmp_path / "x.png") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: pictures need matplotlib")
+    assert "pip install 'm3gn-bench[plot]'" in line
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_interrupted_drawing_leaves_the_old_picture(
+    files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def stop(path: Path, content: bytes) -> int:
+        path.open("wb").write(content[:10])
+        raise error
+
+    out = tmp_path / "x.png"
+    out.write_text("old")
+    monkeypatch.setattr(Path, "write_bytes", stop)
+    assert view(files["block"], "-o", out, "--frames", 1) == (130 if error is KeyboardInterrupt else 2)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.png"]
+    assert out.read_text() == "old"
