@@ -60,7 +60,7 @@ def probe(trajectory: Trajectory) -> tuple[float, ...]:
     return tuple(trajectory.positions[np.ix_(chosen_frames, chosen_nodes)].ravel().tolist())
 
 
-def record(path: Path, folder: Path = FOLDER) -> Path:
+def record(path: Path, folder: Path | None = None) -> Path:
     """Record a dataset file, which must hold the quick tier or more; returns the record's path."""
     with open_file(path) as file:
         metadata = read_metadata(file)
@@ -80,20 +80,20 @@ def record(path: Path, folder: Path = FOLDER) -> Path:
             hashes=hashes,
             probes={key: probe(read_trajectory(file, key)) for key in quick},
         )
-    destination = folder / f"{metadata.scene}.json"
+    destination = (folder or FOLDER) / f"{metadata.scene}.json"
     write_bytes_atomically(destination, (recorded.model_dump_json(indent=1) + "\n").encode())
     return destination
 
 
-def read_record(scene: str, folder: Path = FOLDER) -> RecordedDataset:
+def read_record(scene: str, folder: Path | None = None) -> RecordedDataset:
     """What is recorded of a scene. Raises DatasetError if nothing is."""
-    path = folder / f"{scene}.json"
+    path = (folder or FOLDER) / f"{scene}.json"
     if not path.is_file():
         raise DatasetError(f"nothing is recorded of {scene}; `m3gn-bench card FILE` records a dataset file")
     return RecordedDataset.model_validate_json(path.read_bytes())
 
 
-def compare(path: Path, folder: Path = FOLDER) -> Reproduction:
+def compare(path: Path, folder: Path | None = None) -> Reproduction:
     """Compare a dataset file with what is recorded of its scene.
 
     Raises:

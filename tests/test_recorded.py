@@ -1,0 +1,99 @@
+"""A record tells the same dataset from another one, bit by bit or up to rounding."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from m3gn_bench.cli import cli
+from m3gn_bench.datasets import recorded
+from m3gn_bench.datasets.card import Moments
+from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory, stored_hashes
+from m3gn_bench.datasets.recorded import compare, probe, read_record, record
+from m3gn_bench.datasets.writer import merge_shards, write_shard
+from m3gn_bench.generators.scene import scene_names
+
+
+def altered(source: Path, folder: Path, change: float, **metadata: Any) -> Path:
+    """A copy of a dataset whose coordinates differ by up to `change` of the scene's half-width."""
+    with open_file(source) as file:
+        described = read_metadata(file).model_copy(update=metadata)
+        shards = {}
+        for key in stored_hashes(file):
+            old = read_trajectory(file, key)
+            moved = old.positions + np.float32(change * described.scale_length)
+            shards[key] = folder / f"{key}.shard"
+            write_shard(shards[key], key, replace(old, positions=moved), described)
+    path = folder / "altered.h5"
+    merge_shards(path, shards, described, lambda split, material: ["sheet_deformation"])
+    return path
+
+
+def test_the_same_file_is_identical(smoke_file: Path, tmp_path: Path) -> None:
+    record(smoke_file, tmp_path)
+    outcome = compare(smoke_file, tmp_path)
+    assert (outcome.ok, outcome.identical, outcome.largest_difference) == (True, True, 0.0)
+    assert outcome.trajectories == 16
+
+
+@pytest.mark.parametrize(("change", "ok"), [(2e-6, True), (1e-3, False)])
+def test_another_file_is_measured(smoke_file: Path, tmp_path: Path, change: float, ok: bool) -> None:
+    record(smoke_file, tmp_path)
+    outcome = compare(altered(smoke_file, tmp_path, change), tmp_path)
+    assert not outcome.identical
+    assert outcome.largest_difference == pytest.approx(change, rel=0.2)
+    assert outcome.ok == ok
+
+
+def test_probe_covers_the_last_frame(smoke_file: Path) -> None:
+    with open_file(smoke_file) as file:
+        trajectory = read_trajectory(file, "test_00000")
+    before = probe(trajectory)
+    changed = trajectory.positions.copy()
+    changed[-1] += 1
+    assert len(before) == 3 * 4 * 3
+    assert probe(replace(trajectory, positions=changed)) != before
+
+
+@pytest.mark.parametrize("change", [{"dataset_version": "9.9"}, {"scene": "unheard_of"}])
+def test_what_is_not_recorded_cannot_be_compared(
+    smoke_file: Path, tmp_path: Path, change: dict[str, str]
+) -> None:
+    record(smoke_file, tmp_path)
+    with pytest.raises(DatasetError, match=r"recorded of"):
+        compare(altered(smoke_file, tmp_path, 0.0, **change), tmp_path)
+
+
+def test_moments_are_those_of_all_vectors() -> None:
+    rng = np.random.default_rng(0)
+    batches = [1e3 + rng.normal(size=(n, 5, 3)) for n in (1, 4, 2)]
+    moments = Moments()
+    for batch in batches:
+        moments.add(batch)
+    together = np.concatenate(batches).reshape(-1, 3)
+    assert moments.mean == pytest.approx(together.mean(0))
+    assert moments.variance == pytest.approx(together.var(0), rel=1e-9)
+
+
+@pytest.mark.parametrize("scene", scene_names())
+def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
+    found = read_record(scene)
+    assert set(found.hashes) == {"smoke", "quick", "paper"}
+    assert len(found.probes) == 96
+
+
+def test_reproduce_command(smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From nothing, against a record of other data: exit code 1. (CI runs it against the good ones.)"""
+    record(altered(smoke_file, tmp_path, 1e-2), tmp_path)
+    monkeypatch.setattr(recorded, "FOLDER", tmp_path)
+    arguments = ["reproduce", "sheet_deformation", "--tier", "smoke", "--workers", "1", "--json"]
+    outcome = CliRunner().invoke(cli, arguments)
+    assert outcome.exit_code == 1
+    found = json.loads(outcome.stdout)
+    assert (found["ok"], found["identical"]) == (False, False)
+    assert found["largest_difference"] == pytest.approx(1e-2, rel=1e-3)
