@@ -267,11 +267,16 @@ class DeformableBlock:
 
 
 def max_force_drop(forces: Array) -> float:
-    """The largest fall of a force [frames] below its largest value so far, relative to that value."""
-    largest = np.maximum.accumulate(forces)
-    if largest[0] <= 0:
-        return 1.0  # no contact where there must be some
-    return float(np.max(1 - forces / largest))
+    """How far the contact force [frames] falls below its largest value so far, relative to that value.
+
+    It may fall once, at the change of material, to that of the new one. After that the circle goes ever
+    deeper and the force grows; where it collapses the circle has punched through or slipped off. Without
+    contact in some frame the drop is 1.
+    """
+    if forces.min() <= 0:
+        return 1.0
+    settled = forces[TRANSIENT:]
+    return float(np.max(1 - settled / np.maximum.accumulate(settled)))
 
 
 @dataclass(frozen=True, eq=False)

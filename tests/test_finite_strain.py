@@ -12,7 +12,7 @@ from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, P
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Response, Setting, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
-from m3gn_bench.generators.solvers.sparse import BandedAssembler
+from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler
 
 E = 10.0
 MATERIALS = [-0.9, 0.0, 0.49]
@@ -116,6 +116,18 @@ def test_small_strains_obey_hooke(poisson_ratio: float, setting: Setting) -> Non
     assert strain[0] == pytest.approx((1 - nu**2 if plane_strain else 1) / E)
     assert strain[1] == pytest.approx((-nu * (1 + nu) if plane_strain else -nu) / E, abs=1e-12)
     assert tangent[0, 1, 0, 1] == pytest.approx(E / (2 * (1 + nu)))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_energy_of_tiny_strains_is_exact(d: int) -> None:
+    """The quadratic form of Hooke's law, where round-off of the naive formula would be a hundred times larger."""
+    law = NeoHookean.from_youngs_modulus(E, 0.3, "3d" if d == 3 else "plane strain")
+    H = 2.0**-24 * np.round(16 * np.random.default_rng(0).uniform(-1, 1, (d, d, 5)))
+    identity = np.eye(d)[:, :, None]
+    tangent = Response(law, np.repeat(identity, 5, axis=2)).tangent()
+    expected = 0.5 * np.einsum("ijp,ijklp,klp->p", H, tangent, H)
+    # Large rotations cost nothing, but here even small ones are of second order: allow strain cubed.
+    assert Response(law, identity + H).energy == pytest.approx(expected, rel=1e-5)
 
 
 def test_inversion_is_infinite_energy(solid: Solid) -> None:
@@ -226,6 +238,7 @@ def test_force_and_stiffness_are_derivatives(solid: Solid, poisson_ratio: float)
 def test_contact_pushes_as_hard_as_it_is_pushed(solid: Solid) -> None:
     contact = obstacles_around(solid)
     state = contact.evaluate(np.zeros(solid.dofs), 0.0)
+    assert state.force is not None
     on_body = state.force.reshape(-1, solid.dimension).sum(0)  # derivative of the energy: minus the force
     assert on_body == pytest.approx(state.resultants.sum(0))
     assert state.resultants[0, -1] > 0  # the ball above is pushed up
@@ -243,7 +256,7 @@ def shaken() -> ImplicitDynamics:
         ModifiedNewton(potential, tolerance=1e-10),
         density=1.0,
         damping=0.3,
-        prescribed=lambda time: 0.05 * np.sin(np.pi * time) ** 2 * sideways,
+        prescribed=lambda time: np.where(sideways, 0.05 * np.sin(np.pi * time) ** 2, 0.0),
     )
 
 
@@ -251,7 +264,7 @@ def shaken() -> ImplicitDynamics:
 def test_time_integration_is_of_second_order(changing: bool) -> None:
     """Also where steps halve and double again and again."""
 
-    def end(refinement: int) -> np.ndarray:
+    def end(refinement: int) -> Array:
         dynamics = shaken()
         for k in range(10):
             steps = refinement * (1 + k % 2) if changing else 2 * refinement
@@ -259,7 +272,7 @@ def test_time_integration_is_of_second_order(changing: bool) -> None:
         assert dynamics.time == pytest.approx(2)
         return dynamics.displacement
 
-    ends = [end(refinement) for refinement in (4, 8, 16, 32)]
+    ends = [end(refinement) for refinement in (8, 16, 32, 64)]
     assert np.abs(ends[-1]).max() > 1e-2  # it does swing
     errors = [np.linalg.norm(a - b) for a, b in pairwise(ends)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
@@ -277,7 +290,7 @@ def pressed(rate: float, max_iterations: int, tolerance: float = 1e-8) -> Implic
         potential,
         ModifiedNewton(potential, tolerance=tolerance, max_iterations=max_iterations),
         density=0.0,
-        prescribed=lambda time: -rate * time * moves,
+        prescribed=lambda time: np.where(moves, -rate * time, 0.0),
     )
 
 

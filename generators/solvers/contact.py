@@ -198,7 +198,7 @@ class PenaltyContact:
     def add_stiffness(self, state: ContactState, matrices: Array) -> None:
         """Add the second derivative of the energy to the element matrices [elements, n, n] of the solid."""
         boundary = self.boundary
-        facets, points, functions = boundary.values.shape
+        points, functions = boundary.values.shape[1:]
         d = boundary.rest.shape[-1]
         for touch in state.touches:
             n = touch.normal

@@ -90,9 +90,8 @@ class Response:
         self._isochoric = law.shear_modulus * J ** (-2 / d)
         self._invariant = np.einsum("ijp,ijp->p", F, F)
         square, inverse_square = J**2, J**-2
-        self.energy = 0.5 * (self._isochoric * self._invariant - d * law.shear_modulus) + (
-            law.bulk_modulus / 8
-        ) * (square + inverse_square - 2)
+        # J^2 + J^-2 - 2 = (J - 1/J)^2, without its cancellation
+        self.energy = 0.5 * law.shear_modulus * _distortion(F, J) + law.bulk_modulus / 8 * (J - 1 / J) ** 2
         self._F_inverse_transposed = cofactor / J
         # P = a F + b F^-T: the factor b, and how it changes with ln J through the volumetric part.
         self._spherical = law.bulk_modulus / 4 * (square - inverse_square) - self._isochoric * (
@@ -131,6 +130,22 @@ def _determinant_and_cofactor(F: Array) -> tuple[Array, Array]:
                 k, m = (j + 1) % 3, (j + 2) % 3
                 cofactor[i, j] = a[k] * b[m] - a[m] * b[k]
     return np.einsum("jp,jp->p", F[0], cofactor[0]), cofactor
+
+
+def _distortion(F: Array, J: Array) -> Array:
+    """J^(-2/d) F:F - d, shape [points], to many digits even near the identity.
+
+    There it is quadratic in H = F - I; if the terms of lower order were left to cancel by themselves, round-off
+    would hide from a line search whether a small step lowers the energy.
+    """
+    if len(F) == 2:
+        return ((F[0, 0] - F[1, 1]) ** 2 + (F[0, 1] + F[1, 0]) ** 2) / J
+    H = F - np.eye(3)[:, :, None]
+    trace = H[0, 0] + H[1, 1] + H[2, 2]
+    minors = 0.5 * (trace**2 - np.einsum("ijp,jip->p", H, H))
+    change = trace + minors + _determinant_and_cofactor(H)[0]  # J - 1
+    shrinkage = np.expm1(-2 / 3 * np.log1p(change))  # J^(-2/3) - 1
+    return (1 + shrinkage) * (2 * trace + np.einsum("ijp,ijp->p", H, H)) + 3 * shrinkage
 
 
 class Solid:
