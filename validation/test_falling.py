@@ -1,6 +1,7 @@
 """The falling scenes: error in time and in space, sensitivity to rounding, and materials beyond their range."""
 
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from m3gn_bench.datasets.recorded import TOLERANCE
 from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.generators import falling
 from m3gn_bench.generators.falling import (
     FRAME_TIME,
     SIZE,
@@ -17,6 +19,7 @@ from m3gn_bench.generators.falling import (
     MixedObjects,
 )
 from m3gn_bench.generators.generate import draw
+from m3gn_bench.generators.solvers import explicit
 
 TEDDY = FallingTeddy()
 IMPACT = 32  # first frame after contact
@@ -128,3 +131,23 @@ def test_random_drops_are_valid() -> None:
         trajectory = scene.simulate(draw(scene, "train", index, DATASET_SEED))
         assert scene.check(trajectory) == []
         assert len(trajectory.positions) * FRAME_TIME == pytest.approx(2.01)
+
+
+@pytest.mark.parametrize(
+    ("term", "without", "smallest_effect"),
+    [("FRICTION", 0.0, 0.1), ("VISCOSITY", 0.0, 0.02), ("nodal pressure", None, 0.02)],
+)
+def test_every_term_matters(
+    monkeypatch: pytest.MonkeyPatch, term: str, without: float | None, smallest_effect: float
+) -> None:
+    """Switched off, each changes the motion by far more than the step does (5e-3 at most, see above)."""
+    parameters = teddy(2)
+    usual = TEDDY.simulate(parameters).positions.astype(np.float64)
+    if without is None:
+        solid = explicit.ExplicitSolid
+        monkeypatch.setattr(explicit, "ExplicitSolid", partial(solid, nodal_pressure=False))
+    else:
+        monkeypatch.setattr(falling, term, without)
+    effect = distance(TEDDY.simulate(parameters).positions.astype(np.float64), usual, LATER)
+    print(f"without {term.lower()}: {effect:.1e}")
+    assert effect > smallest_effect
