@@ -94,11 +94,12 @@ class BandedAssembler:
         Returns the factor and how often sigma was raised (0: the matrix was definite as it is).
 
         Raises:
-            LinAlgError: not even a shift by ten times the diagonal helps (NaN, in practice).
+            LinAlgError: not even a shift by a thousand times the diagonal helps (NaN, in practice).
         """
         diagonal = np.abs(matrix[0])
+        diagonal = np.maximum(diagonal, 0.01 * diagonal.mean())  # an entry may just be changing its sign
         shifted = matrix
-        for attempt in range(8):
+        for attempt in range(10):
             try:
                 return self.factorise(shifted), attempt
             except LinAlgError:
