@@ -188,6 +188,9 @@ def test_ball_falls_at_one_scale(tetra_metadata: Metadata) -> None:
     assert sizes[1:] == pytest.approx(sizes[:1] * 2, rel=0.05)
     fall = DPI * picture.STILL_PANEL / 1.5 * 0.25  # 0.25 from frame to frame, in a panel about 1.5 high
     assert np.diff(heights) == pytest.approx([fall, fall], rel=0.15)
+    landed = draw(ball(), metadata, look, [3])[:, : int(DPI * picture.LEAST_WIDTH / 2)]
+    blue = landed[..., 2] > landed[..., 0] + 50  # flattened by the factor 0.8, and in front of the floor
+    assert blue.sum() == pytest.approx(0.8 * sizes[0], rel=0.1)
 
 
 def test_near_triangles_hide_far_ones(tetra_metadata: Metadata) -> None:
