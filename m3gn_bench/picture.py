@@ -38,6 +38,7 @@ HEAD, FOOT, BAR, TITLE, TICKS = 0.6, 0.6, 1.0, 0.28, 0.6  # what surrounds the f
 GAP = 0.1  # between the frames [inch]
 SCALE = 1.6  # width of what shows the scale, in the corner below [inch]
 MARGIN = 0.05  # around the motion, of its larger extent
+NARROWEST = 0.52  # width over height of one frame: its title must fit
 LEAST_WIDTH = 6.0  # [inch], for the heading
 PALETTE_FRAMES = 8
 LEAST_AREA_CHANGE = 1e-3  # on the colour bar; below is the round-off of float32
@@ -244,7 +245,9 @@ class Picture:
         points = np.concatenate([self.camera(part).reshape(-1, 2) for part in shown])
         lower, upper = points.min(0), points.max(0)
         margin = MARGIN * (float((upper - lower).max()) or 1.0)
-        return lower - margin, upper + margin
+        width, height = upper - lower + 2 * margin
+        beside = max(0.0, NARROWEST * height - width) / 2
+        return lower - margin - [beside, 0], upper + margin + [beside, 0]
 
     # --- the figure ---------------------------------------------------------------------------------------
 
