@@ -1,0 +1,145 @@
+"""What the checks of the tissue share: load cases, a march with physics that the scene leaves out, errors."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from sheet_cases import relative_error, worst_frame_error
+
+from m3gn_bench.generators.solvers.dynamics import ImplicitDynamics, IncrementalPotential
+from m3gn_bench.generators.solvers.finite_strain import NeoHookean
+from m3gn_bench.generators.solvers.newton import ModifiedNewton
+from m3gn_bench.generators.solvers.sparse import Array
+from m3gn_bench.generators.tissue_manipulation import (
+    DAMPING,
+    DENSITY,
+    FRAME,
+    MATERIALS,
+    THICKNESS,
+    TRANSITIONS,
+    Slab,
+    TissueFidelity,
+    TissueManipulation,
+    TissueParameters,
+    make_slab,
+)
+
+__all__ = ["CASES", "DEFAULT", "FINE", "GRAVITY", "displacements", "draw", "march", "relative_error",
+           "worst_frame_error"]  # fmt: skip
+
+GRAVITY = 9810.0  # [mm/s^2]
+DEFAULT = TissueManipulation.fidelities["default"]
+FINE = TissueFidelity((12, 2, 32), 1, 1e-6)
+
+# One pull per material: from the left against the slab's lean, straight up, and from the right along it.
+CASES = [
+    TissueParameters(*material, patch=patch, angle=angle)
+    for material, patch, angle in zip(MATERIALS, (4, 9, 15), (150.0, 90.0, 20.0), strict=True)
+]
+SEED = 4711
+
+
+def draw(index: int) -> TissueParameters:
+    """A draw of another seed than any dataset's."""
+    return TissueManipulation().sample(np.random.default_rng([SEED, index]), index)
+
+
+@lru_cache
+def displacements(parameters: TissueParameters, level: TissueFidelity = DEFAULT) -> Array:
+    """Displacements [mm] of the recorded vertices as the scene writes them, shape [frames, 361, 3]."""
+    trajectory = TissueManipulation().simulate_with(parameters, level)
+    return trajectory.positions.astype(np.float64) - trajectory.mesh.rest_positions
+
+
+class _LoadedPotential(IncrementalPotential):
+    """With a constant body force and stiffness-proportional (Rayleigh) damping of one backward Euler step.
+
+    The damping uses the stiffness at rest, K: its incremental potential is beta/(2 h) |u - u_before|^2_K.
+    """
+
+    def __init__(
+        self,
+        slab: Slab,
+        law: NeoHookean,
+        *,
+        acceleration: Array,
+        stiffness_damping: float,
+        force_floor: float,
+    ) -> None:
+        super().__init__(slab.body, law, force_floor=force_floor)
+        solid = slab.body.solid
+        mass = np.asarray(slab.body.nodal_mass.sum(1)).ravel()
+        self.load = DENSITY * np.outer(mass, acceleration).ravel()
+        at_rest = solid.element_stiffness(solid.response(np.zeros(solid.dofs), law))
+        local = solid.element_dofs
+        rows, columns = np.repeat(local, local.shape[1], axis=1), np.tile(local, (1, local.shape[1]))
+        factor = stiffness_damping / FRAME
+        self.viscosity = factor * coo_matrix((at_rest.ravel(), (rows.ravel(), columns.ravel()))).tocsr()
+        self.banded_viscosity = factor * self.assembler.matrix(at_rest)
+        self.before = np.zeros(solid.dofs)
+
+    def energy_and_force(self, x: Array) -> tuple[float, Array]:
+        energy, force = super().energy_and_force(x)
+        if not np.isfinite(energy):
+            return energy, force
+        u = self.expand(x)
+        viscous = self.viscosity @ (u - self.before)
+        energy += 0.5 * float((u - self.before) @ viscous) - float(self.load @ u)
+        return energy, force + (viscous - self.load)[self.assembler.free]
+
+    def stiffness(self, x: Array) -> Array:
+        return super().stiffness(x) + self.banded_viscosity
+
+
+def march(
+    parameters: TissueParameters,
+    level: TissueFidelity = DEFAULT,
+    *,
+    density: float = DENSITY,
+    acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    stiffness_damping: float = 0.0,
+    distance: Callable[[float], float] = lambda time: time,
+    transitions: int = TRANSITIONS,
+) -> Array:
+    """Displacements of the recorded vertices [mm], shape [transitions + 1, 361, 3], with other physics.
+
+    Args:
+        parameters: the draw.
+        level: the discretisation.
+        density: 0 for a quasi-static pull.
+        acceleration: body force per mass [mm/s^2], e.g. of gravity.
+        stiffness_damping: Rayleigh's coefficient [s]; only with one step per frame.
+        distance: the gripper's travel over its speed at a time [s].
+        transitions: how many frames to march.
+    """
+    slab = make_slab(parameters.patch, level.cells)
+    law = NeoHookean.from_youngs_modulus(parameters.youngs_modulus, parameters.poisson_ratio, "3d")
+    velocity = parameters.speed * parameters.direction
+    floor = 1e-9 * parameters.youngs_modulus * THICKNESS**2
+    potential: IncrementalPotential
+    if stiffness_damping or any(acceleration):
+        assert level.steps == 1, "the damping knows one step per frame"
+        potential = _LoadedPotential(
+            slab,
+            law,
+            acceleration=np.array(acceleration),
+            stiffness_damping=stiffness_damping,
+            force_floor=floor,
+        )
+    else:
+        potential = IncrementalPotential(slab.body, law, force_floor=floor)
+    dynamics = ImplicitDynamics(
+        potential,
+        ModifiedNewton(potential, tolerance=level.tolerance),
+        density=density,
+        damping=DAMPING,
+        prescribed=lambda time: slab.prescribed(distance(time) * velocity),
+    )
+    states = np.zeros((transitions + 1, slab.interpolation.shape[0], 3))
+    for frame in range(1, transitions + 1):
+        if isinstance(potential, _LoadedPotential):
+            potential.before = dynamics.displacement
+        dynamics.advance(frame * FRAME, level.steps, f"frame {frame}")
+        states[frame] = slab.interpolation @ dynamics.displacement.reshape(-1, 3)
+    return states
