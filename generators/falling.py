@@ -9,8 +9,7 @@ objects are not published, so these are ours.
 
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,7 @@ from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
 from m3gn_bench.generators.errors import GeneratorError
-from m3gn_bench.generators.objects import SoftBody, load_object, read_object
+from m3gn_bench.generators.objects import SoftBody, load_object
 from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
 
 SIZE = 0.5  # [m], an object's largest extent in its own axes
@@ -232,7 +231,7 @@ class _FallingObjects:
         self, start: np.ndarray, tetrahedra: np.ndarray, parameters: FallParameters, level: FallFidelity
     ) -> tuple[TetrahedralSolid, int]:
         """The body, ready to be moved by the chosen solver, and that solver's substeps per frame."""
-        scene = {
+        scene: dict[str, Any] = {
             "density": DENSITY,
             "youngs_modulus": parameters.youngs_modulus,
             "poisson_ratio": parameters.poisson_ratio,
@@ -257,19 +256,14 @@ class FallingTeddy(_FallingObjects):
     """One object, the teddy, or the user's own.
 
     Attributes:
-        mesh: drop this object instead: a file that `read_object` reads. It is read once, here.
+        mesh: drop this body instead (see `read_object`).
     """
 
-    mesh: Path | SoftBody | None = None
+    mesh: SoftBody | None = None
 
     name: ClassVar[str] = "falling_teddy"
     tasks: ClassVar[tuple[str, ...]] = ("falling_teddy",)
     paper_sizes: ClassVar[dict[Split, int]] = {"train": 700, "validation": 150, "test": 150}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if isinstance(self.mesh, Path):
-            object.__setattr__(self, "mesh", read_object(self.mesh))
 
     @property
     def objects(self) -> tuple[str, ...]:

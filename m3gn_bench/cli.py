@@ -169,7 +169,11 @@ def generate(
     from m3gn_bench.tasks import TASKS
 
     report = Report(as_json)
-    options: dict[str, Any] = {"solver": solver, "mesh": mesh}
+    options: dict[str, Any] = {"solver": solver}
+    if mesh is not None:
+        from m3gn_bench.generators.objects import read_object
+
+        options["mesh"] = read_object(mesh)
     scene = get_scene(
         TASKS[scene_name].scene if scene_name in TASKS else scene_name,
         **{name: value for name, value in options.items() if value is not None},

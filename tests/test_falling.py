@@ -21,7 +21,7 @@ from m3gn_bench.generators.falling import (
     MixedObjects,
 )
 from m3gn_bench.generators.generate import draw, generate
-from m3gn_bench.generators.objects import load_object, write_object
+from m3gn_bench.generators.objects import load_object, read_object, write_object
 from m3gn_bench.generators.scene import get_scene
 
 TEDDY = FallingTeddy()
@@ -104,7 +104,7 @@ def test_a_users_own_object(tmp_path: Path) -> None:
     """A scene with another object says so in its variant, and takes it to the workers as it is."""
     path = tmp_path / "worm.npz"
     write_object(replace(load_object("gummy_worm_2"), name="worm"), path)
-    scene = get_scene("falling_teddy", mesh=path)
+    scene = get_scene("falling_teddy", mesh=read_object(path))
     (name,) = scene.variant.values()
     assert name.startswith("worm-")
     path.unlink()

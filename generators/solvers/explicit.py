@@ -19,10 +19,15 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.solvers.explicit_kernels import (
+    cell_volumes,
+    corner_forces,
+    move,
+    nodal_pressures,
+)
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
 
-wp.set_module_options({"enable_backward": False})
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
 CAPTURED = 50  # substeps per recorded graph: long enough to hide the launch, short enough to record fast
@@ -176,147 +181,25 @@ class ExplicitSolid(TetrahedralSolid):
         self._x.assign(np.ascontiguousarray(positions, dtype=np.float64))
         self._v.assign(np.ascontiguousarray(velocities, dtype=np.float64))
         self._launch_forces()
-        corner_forces = self._forces.numpy()
-        forces = np.stack([self.gather(corner_forces[:, axis]) for axis in range(3)], axis=1)
+        by_corner = self._forces.numpy()
+        forces = np.stack([self.gather(by_corner[:, axis]) for axis in range(3)], axis=1)
         gravity = np.where(self._inverse_masses > 0, -self.gravity, 0.0)
         return forces * self._inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
 
     def _launch_forces(self) -> None:
         body = [self._tetrahedra, self._rest, self._volumes]
         if self.nodal_pressure:
-            self._launch(_cell_volumes, self.cells, self._x, *body, self._cell_volumes)
+            self._launch(cell_volumes, self.cells, self._x, *body, self._cell_volumes)
             gather = [self._start, self._incident, self._nodal_volumes]
-            self._launch(_nodal_pressures, self.nodes, self._cell_volumes, *gather, self.lam, self._pressures)
+            self._launch(nodal_pressures, self.nodes, self._cell_volumes, *gather, self.lam, self._pressures)
         law = [self.mu, self.lam, self.viscosity, self.nodal_pressure]
-        self._launch(_corner_forces, self.cells, self._x, self._v, *body, self._pressures, *law, self._forces)
+        self._launch(corner_forces, self.cells, self._x, self._v, *body, self._pressures, *law, self._forces)
 
     def _step(self, substep: float) -> None:
         self._launch_forces()
         gather = [self._forces, self._start, self._incident, self._inverse_mass]
         world = [self.gravity, self.friction, self.floor, substep]
-        self._launch(_move, self.nodes, *gather, *world, self._x, self._v)
+        self._launch(move, self.nodes, *gather, *world, self._x, self._v)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object) -> None:
         wp.launch(kernel, dim=size, inputs=list(inputs), device=self.device)
-
-
-@wp.func
-def _deformation_gradient(
-    x: wp.array(dtype=wp.vec3d), corners: wp.vec4i, inverse_edges: wp.mat33d
-) -> wp.mat33d:
-    origin = x[corners[0]]
-    return (
-        wp.matrix_from_cols(x[corners[1]] - origin, x[corners[2]] - origin, x[corners[3]] - origin)
-        * inverse_edges
-    )
-
-
-@wp.kernel
-def _cell_volumes(
-    x: wp.array(dtype=wp.vec3d),
-    tetrahedra: wp.array(dtype=wp.vec4i),
-    rest: wp.array(dtype=wp.mat33d),
-    volumes: wp.array(dtype=wp.float64),
-    current: wp.array(dtype=wp.float64),
-):
-    cell = wp.tid()
-    current[cell] = wp.determinant(_deformation_gradient(x, tetrahedra[cell], rest[cell])) * volumes[cell]
-
-
-@wp.kernel
-def _nodal_pressures(
-    current: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    incident: wp.array(dtype=wp.int32),
-    nodal_volumes: wp.array(dtype=wp.float64),
-    lam: wp.float64,
-    pressures: wp.array(dtype=wp.float64),
-):
-    node = wp.tid()
-    volume = wp.float64(0.0)
-    for entry in range(start[node], start[node + 1]):
-        volume += current[incident[entry] // 4]
-    ratio = wp.float64(0.25) * volume / nodal_volumes[node]
-    pressures[node] = lam * (ratio - wp.float64(1.0))
-
-
-@wp.kernel
-def _corner_forces(
-    x: wp.array(dtype=wp.vec3d),
-    v: wp.array(dtype=wp.vec3d),
-    tetrahedra: wp.array(dtype=wp.vec4i),
-    rest: wp.array(dtype=wp.mat33d),
-    volumes: wp.array(dtype=wp.float64),
-    pressures: wp.array(dtype=wp.float64),
-    mu: wp.float64,
-    lam: wp.float64,
-    viscosity: wp.float64,
-    nodal_pressure: wp.bool,
-    forces: wp.array(dtype=wp.vec3d),
-):
-    cell = wp.tid()
-    corners = tetrahedra[cell]
-    inverse_edges = rest[cell]
-    zero = wp.float64(0.0)
-    F = _deformation_gradient(x, corners, inverse_edges)
-    f1 = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
-    f2 = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
-    f3 = wp.vec3d(F[0, 2], F[1, 2], F[2, 2])
-    c1 = wp.cross(f2, f3)
-    dilatation = wp.dot(f1, c1) - wp.float64(1.0)
-    pressure = lam * dilatation
-    if nodal_pressure:
-        pressure = wp.float64(0.25) * (
-            pressures[corners[0]] + pressures[corners[1]] + pressures[corners[2]] + pressures[corners[3]]
-        )
-    cofactor = wp.matrix_from_cols(c1, wp.cross(f3, f1), wp.cross(f1, f2))
-    second = wp.mat33d(mu, zero, zero, zero, mu, zero, zero, zero, mu)
-    if viscosity > zero:
-        rate = wp.transpose(F) * _deformation_gradient(v, corners, inverse_edges)
-        second += (rate + wp.transpose(rate)) * viscosity  # S = 2 eta dE/dt, dE/dt = sym(F^T dF/dt)
-    stress = F * second + cofactor * (mu * dilatation - mu + pressure)
-    H = stress * wp.transpose(inverse_edges * volumes[cell])
-    a = wp.vec3d(H[0, 0], H[1, 0], H[2, 0])
-    b = wp.vec3d(H[0, 1], H[1, 1], H[2, 1])
-    c = wp.vec3d(H[0, 2], H[1, 2], H[2, 2])
-    forces[4 * cell] = a + b + c
-    forces[4 * cell + 1] = -a
-    forces[4 * cell + 2] = -b
-    forces[4 * cell + 3] = -c
-
-
-@wp.kernel
-def _move(
-    forces: wp.array(dtype=wp.vec3d),
-    start: wp.array(dtype=wp.int32),
-    incident: wp.array(dtype=wp.int32),
-    inverse_masses: wp.array(dtype=wp.float64),
-    gravity: wp.float64,
-    friction: wp.float64,
-    floor: wp.bool,
-    substep: wp.float64,
-    x: wp.array(dtype=wp.vec3d),
-    v: wp.array(dtype=wp.vec3d),
-):
-    node = wp.tid()
-    inverse_mass = inverse_masses[node]
-    if inverse_mass == wp.float64(0.0):
-        return
-    force = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
-    for entry in range(start[node], start[node + 1]):
-        force += forces[incident[entry]]
-    u = v[node] + force * (substep * inverse_mass)
-    u = wp.vec3d(u[0], u[1], u[2] - gravity * substep)
-    arrival = -x[node][2] / substep  # the velocity with which the node just reaches the floor
-    y = x[node] + u * substep
-    if floor and u[2] < arrival:
-        impulse = arrival - u[2]
-        sliding = wp.sqrt(u[0] * u[0] + u[1] * u[1])
-        kept = wp.float64(0.0)
-        if sliding > friction * impulse:
-            kept = wp.float64(1.0) - friction * impulse / sliding
-        u = wp.vec3d(u[0] * kept, u[1] * kept, arrival)
-        y = x[node] + u * substep
-        y = wp.vec3d(y[0], y[1], wp.float64(0.0))  # so that not even round-off passes the floor
-    v[node] = u
-    x[node] = y
