@@ -174,7 +174,7 @@ def find_dataset(
         try:
             with open_file(path) as file:
                 metadata = read_metadata(file)
-                usual = (scene, "default", {}, DATASET_SEED)
+                usual: tuple[object, ...] = (scene, "default", {}, DATASET_SEED)
                 found = (metadata.scene, metadata.fidelity, metadata.variant, metadata.seed)
                 if found == usual and version in (None, metadata.dataset_version):
                     content_hash(file, tier, splits)

@@ -64,7 +64,7 @@ def record(path: Path, folder: Path | None = None) -> Path:
     """Record a dataset file, which must hold the quick tier or more; returns the record's path."""
     with open_file(path) as file:
         metadata = read_metadata(file)
-        hashes = {}
+        hashes: dict[str, str] = {}
         for tier in TIERS:
             try:
                 hashes[tier] = content_hash(file, tier)

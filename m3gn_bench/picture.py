@@ -399,7 +399,9 @@ class Picture:
             below = self.positions[frame].copy()
             below[:, 2] = self.floor.corners[0, 2]
             shadow = self.camera(below)[self.faces]
-            panel.add_collection(PolyCollection(shadow, facecolor=SHADOW, edgecolor=SHADOW, lw=0.3, zorder=1))
+            panel.add_collection(
+                PolyCollection(list(shadow), facecolor=SHADOW, edgecolor=SHADOW, lw=0.3, zorder=1)
+            )
 
     def _draw_surface(self, panel: Axes, frame: int) -> None:
         points = self.camera(self.positions[frame])
@@ -418,7 +420,7 @@ class Picture:
         triangles = points[self.faces[order]]
         panel.add_collection(
             PolyCollection(
-                triangles, facecolor=colours[order], edgecolor=EDGE * colours[order], lw=0.4, zorder=2
+                list(triangles), facecolor=colours[order], edgecolor=EDGE * colours[order], lw=0.4, zorder=2
             )
         )
         if self.flat:

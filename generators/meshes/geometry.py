@@ -55,7 +55,7 @@ def edge_uses(triangles: Indices) -> tuple[Indices, Indices]:
     """Undirected edges [edges, 2] and the number of triangles at each [edges]."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, counts = np.unique(edges, axis=0, return_counts=True)
-    return unique, counts
+    return unique, counts.astype(np.int32)
 
 
 def is_closed(triangles: Indices) -> bool:

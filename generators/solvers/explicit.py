@@ -13,6 +13,7 @@ atomics, so the result does not depend on the order of execution. The same code 
 """
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,6 @@ from m3gn_bench.generators.solvers.explicit_kernels import (
 )
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
-
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
 CAPTURED = 50  # substeps per recorded graph: long enough to hide the launch, short enough to record fast
@@ -93,18 +93,21 @@ class ExplicitSolid(TetrahedralSolid):
         flat = self.tetrahedra.ravel()
         incident = np.argsort(flat, kind="stable")
         start = np.searchsorted(flat[incident], np.arange(self.nodes + 1))
-        self._tetrahedra = wp.array(self.tetrahedra, dtype=wp.vec4i, device=device)
-        self._rest = wp.array(self.inverse_edges, dtype=wp.mat33d, device=device)
-        self._volumes = wp.array(self.volumes, dtype=wp.float64, device=device)
-        self._nodal_volumes = wp.array(self.nodal_volumes, dtype=wp.float64, device=device)
-        self._inverse_mass = wp.array(self._inverse_masses, dtype=wp.float64, device=device)
-        self._incident = wp.array(incident, dtype=wp.int32, device=device)
-        self._start = wp.array(start, dtype=wp.int32, device=device)
+        self._tetrahedra = self._upload(self.tetrahedra, wp.vec4i)
+        self._rest = self._upload(self.inverse_edges, wp.mat33d)
+        self._volumes = self._upload(self.volumes, wp.float64)
+        self._nodal_volumes = self._upload(self.nodal_volumes, wp.float64)
+        self._inverse_mass = self._upload(self._inverse_masses, wp.float64)
+        self._incident = self._upload(incident, wp.int32)
+        self._start = self._upload(start, wp.int32)
         self._cell_volumes = wp.zeros(self.cells, dtype=wp.float64, device=device)
         self._pressures = wp.zeros(self.nodes, dtype=wp.float64, device=device)
         self._forces = wp.zeros(4 * self.cells, dtype=wp.vec3d, device=device)
         self._x = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
         self._v = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
+
+    def _upload(self, values: np.ndarray, dtype: Any) -> Any:
+        return wp.array(values, dtype=dtype, device=self.device)
 
     # -- the stable step -------------------------------------------------------------------------------
 
