@@ -30,8 +30,8 @@ from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralS
 
 wp.set_module_options({"enable_backward": False})
 
-FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 1 kN sinks in by 0.1 mm
-FLOOR_SKIN = 1e-4  # [m], the height at which the floor's springs begin
+FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 500 N sinks 0.05 mm into the skin
+FLOOR_SKIN = 2e-4  # [m], the height at which the springs begin
 FRICTION_SPEED = 1e-2  # [m/s], slower sliding is resisted less than Coulomb's law says
 ANYWHERE = 1e6  # [m], so far from the floor a node's contact is known beforehand
 CAPTURED = 10  # substeps per recorded graph, at most
@@ -45,7 +45,7 @@ class VertexBlockDescent(TetrahedralSolid):
         tetrahedra: node indices, positively oriented, shape [cells, 4].
         density: [kg/m^3].
         youngs_modulus: [Pa].
-        poisson_ratio: nu in (-1, 0.5).
+        poisson_ratio: nu in [0, 0.5).
         viscosity: eta [Pa s].
         friction: Coulomb's coefficient of the floor.
         gravity: [m/s^2].
