@@ -41,7 +41,7 @@ def solid(**options: Any) -> VertexBlockDescent:
 def test_free_fall(substeps: int, capfd: pytest.CaptureFixture[str]) -> None:
     """To what single precision leaves: taken from differences of positions it would be millimetres. In silence."""
     body = solid(viscosity=100.0)
-    start = body.vertices + (0.0, 0.0, 0.5)
+    start = body.vertices + np.array([0.0, 0.0, 0.5])
     velocity = np.tile([0.5, 0.0, -0.1], (body.nodes, 1))
     motion = body.run(start, velocity, frames=30, frame_time=0.01, substeps=substeps)
     times = 0.01 * np.arange(31)[:, None, None]
@@ -121,7 +121,7 @@ def test_the_floor_holds_and_energy_does_not_grow() -> None:
 def test_sliding_stops_after_coulombs_distance() -> None:
     body = solid(youngs_modulus=2e6, viscosity=2000.0, friction=0.3)
     velocity = np.tile([1.0, 0.0, 0.0], (body.nodes, 1))
-    start = body.vertices + (0.0, 0.0, FLOOR_SKIN)
+    start = body.vertices + np.array([0.0, 0.0, FLOOR_SKIN])
     motion = body.run(start, velocity, frames=40, frame_time=0.01, substeps=40)
     travelled = (motion.positions[:, :, 0] - start[:, 0]) @ body.masses / body.masses.sum()
     assert travelled[-1] == pytest.approx(1 / (2 * 0.3 * 9.81), rel=0.03)
