@@ -10,7 +10,7 @@ the slab's shape is our own.
 Units are mm, g and s, so forces are in uN and stresses in uN/mm^2 = Pa.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from typing import ClassVar
@@ -241,6 +241,14 @@ class TissueManipulation:
         if out_of_plane > MAX_ASYMMETRY:
             problems.append(f"the wall buckles out of its plane, by {out_of_plane:.2g} mm")
         return problems
+
+    def extreme_materials(self, parameters: TissueParameters) -> tuple[TissueParameters, TissueParameters]:
+        """The same pull of the softest and of the stiffest of the materials."""
+        soft, stiff = (
+            replace(parameters, poisson_ratio=ratio, youngs_modulus=modulus)
+            for ratio, modulus in (MATERIALS[0], MATERIALS[1])
+        )
+        return soft, stiff
 
     def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
         """There is one task."""
