@@ -46,7 +46,7 @@ SURFACE_FORMATS = {
 }  # by trimesh; .npz is our own, meshio reads the rest
 
 # A user's surface: what to aim at, the better of which is kept.
-TARGETS = {"surface_nodes": (304, 320), "edge_factors": (1.15,), "envelopes": (0.005,)}
+SURFACE_NODES, EDGE_FACTOR, ENVELOPE = (304, 320), 1.15, 0.005
 
 SMALLEST_CELL = 1e-12  # volume over the cube of the largest extent, below which a cell is flat
 SMALLEST_EXTENT = 1e-3  # over the largest
@@ -338,7 +338,7 @@ def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
 
     usable = [
         candidate
-        for candidate in candidates(vertices, triangles, recipes(**TARGETS))
+        for candidate in candidates(vertices, triangles, recipes(SURFACE_NODES, [EDGE_FACTOR], [ENVELOPE]))
         if candidate.surface_nodes <= MAX_SURFACE_NODES
     ]
     if not usable:

@@ -84,7 +84,7 @@ def cluster_surface(vertices: Floats, triangles: Indices, nodes: int) -> tuple[F
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pyacvd calls what pyvista has deprecated
-        clustering = Clustering(pyvista.PolyData.from_regular_faces(vertices, triangles))
+        clustering = Clustering(pyvista.PolyData.from_regular_faces(vertices, triangles.astype(int)))
         while clustering.mesh.n_points < POINTS_PER_CLUSTER * nodes:
             clustering.subdivide(1)
         clusters = np.asarray(clustering.cluster(nodes))
