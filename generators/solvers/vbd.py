@@ -31,7 +31,9 @@ without nodal pressure; CPU seconds per trajectory of 2 s on a busy core):
      5 x 160                      -               2.3 %           130
 
 Few iterations and many substeps are best at the same price; `explicit` needs 1 and 4 s for 0.2 % and less. In the
-stiff case the last 2 % are friction's: without it 0.5 % are left, with it more substeps do not help.
+stiff case the last 2 % are friction's: without it 0.5 % are left, with it more substeps do not help. Over nine random
+draws (nu up to 0.46) 2 x 40, 2 x 80 and 2 x 160 are off by 1.9, 0.9 and 0.45 % in the mean; at nu 0.499 the first two
+gain energy in the impact (more than 1 % of it within a frame), the third does not.
 """
 
 import importlib.util
