@@ -5,6 +5,7 @@ with their hashes (folder `meshes`), and a user's surface is meshed once, in the
 scene holds the body, and worker processes get it with the scene, node for node.
 """
 
+import hashlib
 import importlib
 import io
 import json
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from m3gn_bench.datasets.trajectory import hash_arrays
+from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.generators.errors import GeneratorError
 from m3gn_bench.generators.meshes.geometry import (
     Floats,
@@ -188,6 +190,26 @@ def read_object(path: Path) -> SoftBody:
     if "tetra" in cells:
         return _from_tetrahedra(path, vertices, cells["tetra"])
     return _from_surface(path, vertices, cells["triangle"])
+
+
+def read_or_keep_object(path: Path, folder: Path) -> SoftBody:
+    """`read_object`, but of a file that was read before, the body that was made of it then.
+
+    It is kept in `folder` under the name of the file and a hash of its content, so that a dataset that is
+    interrupted, or made again, has the same tetrahedra.
+
+    Raises:
+        GeneratorError: see `read_object`.
+    """
+    if path.suffix == ".npz" or not path.is_file():
+        return read_object(path)
+    kept = folder / f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}.npz"
+    if not kept.is_file():
+        body = read_object(path)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **body.arrays())  # type: ignore[arg-type]
+        write_bytes_atomically(kept, buffer.getvalue())
+    return replace(read_object(kept), name=path.stem)
 
 
 def _optional(library: str, path: Path) -> Any:

@@ -171,9 +171,9 @@ def generate(
     report = Report(as_json)
     options: dict[str, Any] = {"solver": solver}
     if mesh is not None:
-        from m3gn_bench.generators.objects import read_object
+        from m3gn_bench.generators.objects import read_or_keep_object
 
-        options["mesh"] = read_object(mesh)
+        options["mesh"] = read_or_keep_object(mesh, out or data)
     scene = get_scene(
         TASKS[scene_name].scene if scene_name in TASKS else scene_name,
         **{name: value for name, value in options.items() if value is not None},

@@ -19,6 +19,7 @@ from m3gn_bench.generators.objects import (
     load_object,
     object_names,
     read_object,
+    read_or_keep_object,
     write_object,
 )
 
@@ -397,3 +398,19 @@ def test_published_hashes_are_complete() -> None:
             0.5 * body.vertices, body.tetrahedra, youngs_modulus=1e6, poisson_ratio=0.3, density=1000.0
         )
         assert entry["stable_step_seconds"] == pytest.approx(step, rel=1e-3)
+
+
+def test_a_surface_is_meshed_once(tmp_path: Path) -> None:
+    """fTetWild makes other tetrahedra each time; what was made once of a file is found again."""
+    for library in ("trimesh", "pyacvd", "pytetwild"):
+        pytest.importorskip(library)
+    path = write_stl(tmp_path / "box.stl", box(1).vertices, box(1).surface)
+    first = read_or_keep_object(path, tmp_path / "data")
+    (kept,) = (tmp_path / "data").iterdir()
+    again = read_or_keep_object(path, tmp_path / "data")
+    assert (first.name, again.name) == ("box", "box")
+    assert first.content_hash() == again.content_hash() == read_object(kept).content_hash()
+
+    write_stl(path, 2 * box(1).vertices + np.array([0, 0, 0.3]), box(1).surface)  # another file
+    read_or_keep_object(path, tmp_path / "data")
+    assert len(list((tmp_path / "data").iterdir())) == 2
