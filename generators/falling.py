@@ -62,8 +62,8 @@ class FallFidelity:
 
     refinements: int
     courant: float
-    vbd_iterations: int = 10
-    vbd_substeps: int = 10
+    vbd_iterations: int
+    vbd_substeps: int
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class _FallingObjects:
     scale_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.5)
     scale_length: ClassVar[float] = 0.5
     fidelities: ClassVar[dict[str, FallFidelity]] = {
-        "fast": FallFidelity(refinements=0, courant=0.95),
-        "default": FallFidelity(refinements=0, courant=0.7),
-        "reference": FallFidelity(refinements=1, courant=0.7, vbd_iterations=20, vbd_substeps=20),
+        "fast": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40),
+        "default": FallFidelity(refinements=0, courant=0.7, vbd_iterations=2, vbd_substeps=160),
+        "reference": FallFidelity(refinements=1, courant=0.7, vbd_iterations=5, vbd_substeps=160),
     }
 
     def __post_init__(self) -> None:

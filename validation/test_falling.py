@@ -35,7 +35,9 @@ def positions(parameters: FallParameters, courant: float, refinements: int = 0) 
     """Recorded positions at a discretisation of one's own."""
 
     class Scene(FallingTeddy):
-        fidelities: ClassVar[dict[str, FallFidelity]] = {"default": FallFidelity(refinements, courant)}
+        fidelities: ClassVar[dict[str, FallFidelity]] = {
+            "default": FallFidelity(refinements, courant, vbd_iterations=2, vbd_substeps=160)
+        }
 
     return Scene().simulate(parameters).positions.astype(np.float64)
 
