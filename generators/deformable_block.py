@@ -8,7 +8,7 @@ ground, and of inertia, which is there to make the sudden change of material a s
 jump. Source: paper, sections 5 and C; sizes, ratios and numbers follow the description of the original data.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from importlib.metadata import version
 from typing import ClassVar, Literal
@@ -149,33 +149,15 @@ class DeformableBlock:
         """
         level = self.fidelities[fidelity]
         block = make_block(parameters.widths, level.cells)
-        disc = Disc(
-            radius=parameters.radius,
-            start=(parameters.start, BASE + HEIGHT + parameters.radius),
-            velocity=(0.0, -parameters.speed),
-        )
-        contact = PenaltyContact(
-            block.contact_points,
-            penalty=PENALTY_RATIO * parameters.youngs_modulus,
-            obstacles=[disc, Floor(BASE)],
-        )
+        dynamics, disc = self.prepare(parameters, block.body, block.contact_points, level.tolerance)
         first, second = parameters.poisson_ratios
-        potential = IncrementalPotential(
-            block.body,
-            self._law(parameters.youngs_modulus, first),
-            contact=contact,
-            force_floor=1e-6 * parameters.youngs_modulus * HEIGHT,
-        )
-        newton = ModifiedNewton(potential, tolerance=level.tolerance)
-        dynamics = ImplicitDynamics(potential, newton, density=DENSITY, damping=DAMPING)
-
         states = np.empty((RECORDED_FRAMES, block.body.solid.dofs))
         forces = np.empty(RECORDED_FRAMES)
         for k in range(1, HIDDEN_FRAMES + 1):
             label = f"frame {k - HIDDEN_FRAMES} (frame 0 is the first recorded)"
             dynamics.advance(FRAME * k, level.hidden_steps, label)
         states[0], forces[0] = dynamics.displacement, dynamics.contact_forces[0, 1]
-        potential.law = self._law(parameters.youngs_modulus, second)
+        dynamics.potential.law = self.law(parameters.youngs_modulus, second)
         dynamics.restart()
         for k in range(1, RECORDED_FRAMES):
             steps = level.transient_steps[k - 1] if k <= len(level.transient_steps) else level.steps
@@ -192,7 +174,7 @@ class DeformableBlock:
             disc.depth(points.reshape(-1, 2), FRAME * (HIDDEN_FRAMES + k)).max()
             for k, points in enumerate(block.surface_points.positions(states))
         ]
-        statistics = newton.statistics
+        statistics = dynamics.newton.statistics
         return Trajectory(
             positions=positions.astype(np.float32),
             mesh=block.mesh,
@@ -216,6 +198,39 @@ class DeformableBlock:
                 "max_force_drop": max_force_drop(forces),
             },
         )
+
+    def law(self, youngs_modulus: float, poisson_ratio: float) -> NeoHookean:
+        """The material in the scene's plane state."""
+        return NeoHookean.from_youngs_modulus(
+            youngs_modulus, poisson_ratio, "plane stress" if self.plane == "stress" else "plane strain"
+        )
+
+    def prepare(
+        self,
+        parameters: BlockParameters,
+        body: ConstrainedSolid,
+        contact_points: BoundaryPoints,
+        tolerance: float,
+    ) -> tuple[ImplicitDynamics, Disc]:
+        """A block at rest, of the first material, just touched by the circle; and the circle."""
+        disc = Disc(
+            radius=parameters.radius,
+            start=(parameters.start, BASE + HEIGHT + parameters.radius),
+            velocity=(0.0, -parameters.speed),
+        )
+        contact = PenaltyContact(
+            contact_points,
+            penalty=PENALTY_RATIO * parameters.youngs_modulus,
+            obstacles=[disc, Floor(BASE)],
+        )
+        potential = IncrementalPotential(
+            body,
+            self.law(parameters.youngs_modulus, parameters.poisson_ratios[0]),
+            contact=contact,
+            force_floor=1e-6 * parameters.youngs_modulus * HEIGHT,
+        )
+        newton = ModifiedNewton(potential, tolerance=tolerance)
+        return ImplicitDynamics(potential, newton, density=DENSITY, damping=DAMPING), disc
 
     def check(self, trajectory: Trajectory) -> list[str]:
         """Finite, clamped, no triangle turned over, no punch-through, little penetration, no jump."""
@@ -248,6 +263,14 @@ class DeformableBlock:
             problems.append(f"a node jumps by {steps[jumps[0]]:.2f} mm in frame {jumps[0] + 1}")
         return problems
 
+    def extreme_materials(self, parameters: BlockParameters) -> tuple[BlockParameters, BlockParameters]:
+        """The same indentation, with the smallest and with the largest second ratio, from the same first."""
+        smallest, middle, largest = POISSON_RATIOS
+        return (
+            replace(parameters, poisson_ratios=(middle, smallest)),
+            replace(parameters, poisson_ratios=(middle, largest)),
+        )
+
     def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
         """One task, with all trajectories."""
         return list(self.tasks)
@@ -259,11 +282,6 @@ class DeformableBlock:
     def simulator_versions(self) -> dict[str, str]:
         """Versions of scikit-fem, scipy and numpy."""
         return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
-
-    def _law(self, youngs_modulus: float, poisson_ratio: float) -> NeoHookean:
-        return NeoHookean.from_youngs_modulus(
-            youngs_modulus, poisson_ratio, "plane stress" if self.plane == "stress" else "plane strain"
-        )
 
 
 def max_force_drop(forces: Array) -> float:
