@@ -4,6 +4,7 @@ from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from skfem import ElementQuadS2, MeshQuad
 
 from m3gn_bench.datasets.schema import Fidelity
@@ -65,7 +66,7 @@ def draws_with(poisson_ratio: float, count: int) -> list[BlockParameters]:
 
 def punch(
     mesh_class: Any, element: object, cells: int, integration_order: int
-) -> tuple[ConstrainedSolid, Array]:
+) -> tuple[ConstrainedSolid, NDArray[np.bool_]]:
     """A square of side 200 whose base is clamped, and the middle half of whose top is held by a flat punch.
 
     Args:
@@ -88,7 +89,7 @@ def punch(
     return body, np.isin(body.constrained, 2 * np.flatnonzero(held) + 1)
 
 
-def punched(body: ConstrainedSolid, moves: Array, law: NeoHookean) -> Array:
+def punched(body: ConstrainedSolid, moves: NDArray[np.bool_], law: NeoHookean) -> Array:
     """Displacements on a 9 x 9 lattice of that square when the punch has gone down by 40; no inertia, E = 1."""
     potential = IncrementalPotential(body, law, force_floor=1e-8)
     dynamics = ImplicitDynamics(
