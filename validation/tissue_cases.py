@@ -25,12 +25,12 @@ from m3gn_bench.generators.tissue_manipulation import (
     make_slab,
 )
 
-__all__ = ["CASES", "DEFAULT", "FINE", "GRAVITY", "displacements", "draw", "march", "relative_error",
+__all__ = ["CASES", "DEFAULT", "FAST", "GRAVITY", "displacements", "draw", "march", "relative_error",
            "worst_frame_error"]  # fmt: skip
 
 GRAVITY = 9810.0  # [mm/s^2]
 DEFAULT = TissueManipulation.fidelities["default"]
-FINE = TissueFidelity((12, 2, 32), 1, 1e-6)
+FAST = TissueManipulation.fidelities["fast"]
 
 # One pull per material: from the left against the slab's lean, straight up, and from the right along it.
 CASES = [
@@ -55,7 +55,8 @@ def displacements(parameters: TissueParameters, level: TissueFidelity = DEFAULT)
 class _LoadedPotential(IncrementalPotential):
     """With a constant body force and stiffness-proportional (Rayleigh) damping of one backward Euler step.
 
-    The damping uses the stiffness at rest, K: its incremental potential is beta/(2 h) |u - u_before|^2_K.
+    The damping's incremental potential is beta/(2 h) |u - u_before|^2_K with the tangent stiffness K at the
+    step's beginning (that at rest would resist rotation, too).
     """
 
     def __init__(
@@ -68,28 +69,32 @@ class _LoadedPotential(IncrementalPotential):
         force_floor: float,
     ) -> None:
         super().__init__(slab.body, law, force_floor=force_floor)
-        solid = slab.body.solid
         mass = np.asarray(slab.body.nodal_mass.sum(1)).ravel()
         self.load = DENSITY * np.outer(mass, acceleration).ravel()
-        at_rest = solid.element_stiffness(solid.response(np.zeros(solid.dofs), law))
+        self.viscosity = stiffness_damping / FRAME
+        self.begin_frame(np.zeros(slab.body.solid.dofs))
+
+    def begin_frame(self, before: Array) -> None:
+        """Set the state at the step's beginning, shape [dofs]."""
+        solid = self.body.solid
+        self.before = before
+        matrices = self.viscosity * solid.element_stiffness(solid.response(before, self.law))
         local = solid.element_dofs
         rows, columns = np.repeat(local, local.shape[1], axis=1), np.tile(local, (1, local.shape[1]))
-        factor = stiffness_damping / FRAME
-        self.viscosity = factor * coo_matrix((at_rest.ravel(), (rows.ravel(), columns.ravel()))).tocsr()
-        self.banded_viscosity = factor * self.assembler.matrix(at_rest)
-        self.before = np.zeros(solid.dofs)
+        self.damping = coo_matrix((matrices.ravel(), (rows.ravel(), columns.ravel()))).tocsr()
+        self.banded_damping = self.assembler.matrix(matrices)
 
     def energy_and_force(self, x: Array) -> tuple[float, Array]:
         energy, force = super().energy_and_force(x)
         if not np.isfinite(energy):
             return energy, force
         u = self.expand(x)
-        viscous = self.viscosity @ (u - self.before)
+        viscous = self.damping @ (u - self.before)
         energy += 0.5 * float((u - self.before) @ viscous) - float(self.load @ u)
         return energy, force + (viscous - self.load)[self.assembler.free]
 
     def stiffness(self, x: Array) -> Array:
-        return super().stiffness(x) + self.banded_viscosity
+        return super().stiffness(x) + self.banded_damping
 
 
 def march(
@@ -139,7 +144,7 @@ def march(
     states = np.zeros((transitions + 1, slab.interpolation.shape[0], 3))
     for frame in range(1, transitions + 1):
         if isinstance(potential, _LoadedPotential):
-            potential.before = dynamics.displacement
+            potential.begin_frame(dynamics.displacement)
         dynamics.advance(frame * FRAME, level.steps, f"frame {frame}")
         states[frame] = slab.interpolation @ dynamics.displacement.reshape(-1, 3)
     return states
