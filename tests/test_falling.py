@@ -4,6 +4,7 @@ import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from m3gn_bench.generators.falling import (
     HEIGHT,
     POISSON_RATIOS,
     YOUNGS_MODULI,
+    FallFidelity,
     FallingTeddy,
     MixedObjects,
 )
@@ -81,6 +83,21 @@ def test_soft_and_stiff_are_told_apart() -> None:
     soft, stiff = (replace(parameters, youngs_modulus=e, poisson_ratio=0.3) for e in (1e5, 1e6))
     one, other = (TEDDY.simulate(p, "fast").positions for p in (soft, stiff))
     assert np.mean((one - other) ** 2) / TEDDY.scale_length**2 > 1e-3
+
+
+def test_a_motion_that_diverges_is_computed_with_smaller_steps() -> None:
+    """Beyond the limit of stability the first attempt fails; what comes of it is the usual motion."""
+    parameters = replace(draw(TEDDY, "test", 0, DATASET_SEED), youngs_modulus=1e6, poisson_ratio=0.49)
+
+    class Hasty(FallingTeddy):
+        fidelities: ClassVar[dict[str, FallFidelity]] = {
+            "default": FallFidelity(refinements=0, courant=2.8, vbd_iterations=1, vbd_substeps=1)
+        }
+
+    hasty, usual = Hasty().simulate(parameters), TEDDY.simulate(parameters)
+    assert hasty.diagnostics["substeps_per_frame"] in (40, 80)  # it began with 20
+    assert TEDDY.check(hasty) == []
+    assert np.abs(hasty.positions[:40] - usual.positions[:40]).max() < 2e-3
 
 
 @pytest.mark.parametrize(

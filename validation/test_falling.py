@@ -66,7 +66,7 @@ def test_error_in_space_exceeds_that_in_time() -> None:
     """Each tetrahedron cut into eight: this, not the step, limits the default level."""
     parameters = teddy(youngs_modulus=2e5, poisson_ratio=0.3)
     default = positions(parameters, 0.7)
-    space = distance(default, positions(parameters, 0.7, refinements=1), LATER)
+    space = distance(default, positions(parameters, 0.35, refinements=1), LATER)
     time = distance(default, positions(parameters, 0.7 / 4), LATER)
     print(f"in space {space:.1e}, in time {time:.1e}")
     assert 5 * time < space < 0.2
