@@ -137,7 +137,7 @@ def press_half_space(poisson_ratio: float, setting: Setting) -> tuple[float, flo
     """A disc of radius 50 pressed into a block 120 wide and 60 deep, to a contact of half-width about 1.3.
 
     E is 1. Cells are 0.2 wide under the contact and grow by a quarter from one to the next outside it; the
-    penalty is as stiff, relative to the contact's width, as the scene's is under a contact 60 mm wide.
+    penalty is as stiff, relative to the contact's width, as the scene's is under a contact 80 mm wide.
 
     Returns:
         Radius; force on the disc; x of the contact points, and the pressure there.
