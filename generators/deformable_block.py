@@ -131,7 +131,8 @@ class DeformableBlock:
     def sample(self, rng: np.random.Generator, index: int) -> BlockParameters:
         """Trapezoid and second ratio cycle with the index, through all 27 pairs; the rest is random."""
         widths = TRAPEZOIDS[index % len(TRAPEZOIDS)]
-        second = POISSON_RATIOS[index // len(TRAPEZOIDS) % len(POISSON_RATIOS)]
+        # Shifted by one in every round of trapezoids: short prefixes hold all ratios, 27 draws hold all pairs.
+        second = POISSON_RATIOS[(index + index // len(TRAPEZOIDS)) % len(POISSON_RATIOS)]
         first = float(rng.choice([ratio for ratio in POISSON_RATIOS if ratio != second]))
         reach = START_RANGE * widths[1] / 2
         return BlockParameters(
@@ -174,6 +175,7 @@ class DeformableBlock:
             disc.depth(points.reshape(-1, 2), FRAME * (HIDDEN_FRAMES + k)).max()
             for k, points in enumerate(block.surface_points.positions(states))
         ]
+        drop, drop_frame = max_force_drop(forces)
         statistics = dynamics.newton.statistics
         return Trajectory(
             positions=positions.astype(np.float32),
@@ -194,8 +196,10 @@ class DeformableBlock:
                 "bisections": statistics.bisections,
                 "min_jacobian": dynamics.min_jacobian,
                 "max_penetration": float(max(depth)),
+                "max_penetration_frame": int(np.argmax(depth)),
                 "max_contact_force": float(forces.max()),
-                "max_force_drop": max_force_drop(forces),
+                "max_force_drop": drop,
+                "max_force_drop_frame": drop_frame,
             },
         )
 
@@ -247,12 +251,18 @@ class DeformableBlock:
         if areas.min() <= 0:
             problems.append(f"a triangle turns over in frame {np.flatnonzero(areas.min(1) <= 0)[0]}")
         radius = float(trajectory.loads["radius"][0])
-        depth = trajectory.diagnostics["max_penetration"]
+        found = trajectory.diagnostics
+        depth, frame = found["max_penetration"], found["max_penetration_frame"]
         if depth > MAX_PENETRATION * radius:
-            problems.append(f"the circle of radius {radius:.1f} mm sinks in by {depth:.2f} mm")
-        drop = trajectory.diagnostics["max_force_drop"]
+            problems.append(
+                f"the circle of radius {radius:.1f} mm sinks in by {depth:.2f} mm in frame {frame:.0f}"
+            )
+        drop, frame = found["max_force_drop"], found["max_force_drop_frame"]
         if drop > MAX_FORCE_DROP:
-            problems.append(f"the contact force falls by {drop:.0%}: the circle punches through or slips off")
+            problems.append(
+                f"the contact force has fallen by {drop:.0%} in frame {frame:.0f}: the circle punches through "
+                "or slips off"
+            )
         assert trajectory.collider_positions is not None
         collider = trajectory.collider_positions.astype(np.float64)
         travel = np.linalg.norm(np.diff(collider, axis=0), axis=-1).max(-1)
@@ -284,17 +294,18 @@ class DeformableBlock:
         return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
 
 
-def max_force_drop(forces: Array) -> float:
-    """How far the contact force [frames] falls below its largest value so far, relative to that value.
+def max_force_drop(forces: Array) -> tuple[float, int]:
+    """How far the contact force [frames] falls below its largest value so far, relative to that, and in which frame.
 
     It may fall once, at the change of material, to that of the new one. After that the circle goes ever
     deeper and the force grows; where it collapses the circle has punched through or slipped off. Without
     contact in some frame the drop is 1.
     """
     if forces.min() <= 0:
-        return 1.0
+        return 1.0, int(forces.argmin())
     settled = forces[TRANSIENT:]
-    return float(np.max(1 - settled / np.maximum.accumulate(settled)))
+    drops = 1 - settled / np.maximum.accumulate(settled)
+    return float(drops.max()), TRANSIENT + int(drops.argmax())
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,7 @@ def test_draws_cover_all_pairs_of_trapezoid_and_ratio_evenly() -> None:
     assert radii.mean() == pytest.approx(sum(RADIUS) / 3, rel=0.1)
     reach = np.array([abs(d.start) / (d.widths[1] / 2) for d in draws])
     assert START_RANGE * 0.9 < reach.max() < START_RANGE
+    assert {d.poisson_ratios[1] for d in draws[:4]} == set(POISSON_RATIOS)  # so small tiers have them, too
 
 
 # --- what is recorded -------------------------------------------------------------------------------------
@@ -181,7 +182,10 @@ def test_checks_see_bad_positions(trajectory: Trajectory) -> None:
 
 @pytest.mark.parametrize(
     ("diagnostic", "value", "message"),
-    [("max_penetration", 4.0, "sinks in by 4.00 mm"), ("max_force_drop", 0.6, "contact force falls by 60%")],
+    [
+        ("max_penetration", 4.0, "sinks in by 4.00 mm"),
+        ("max_force_drop", 0.6, "contact force has fallen by 60% in frame"),
+    ],
 )
 def test_checks_see_bad_contact(trajectory: Trajectory, diagnostic: str, value: float, message: str) -> None:
     (problem,) = spoiled(trajectory, diagnostics={**trajectory.diagnostics, diagnostic: value})
@@ -190,9 +194,9 @@ def test_checks_see_bad_contact(trajectory: Trajectory, diagnostic: str, value: 
 
 def test_force_drop() -> None:
     """The first two transitions may relax the force; later it must not collapse, and never vanish."""
-    assert max_force_drop(np.array([9.0, 4, 5, 6, 7])) == 0
-    assert max_force_drop(np.array([9.0, 4, 5, 8, 2, 9])) == pytest.approx(0.75)
-    assert max_force_drop(np.array([9.0, 0, 5, 6, 7])) == 1
+    assert max_force_drop(np.array([9.0, 4, 5, 6, 7])) == (0, 2)
+    assert max_force_drop(np.array([9.0, 4, 5, 8, 2, 9])) == (pytest.approx(0.75), 4)
+    assert max_force_drop(np.array([9.0, 0, 5, 6, 7])) == (1, 1)
 
 
 def test_a_circle_smaller_than_the_cells_punches_through_and_is_rejected() -> None:
