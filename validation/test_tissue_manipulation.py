@@ -84,12 +84,10 @@ def test_second_order_in_time() -> None:
 
 
 def test_solver_tolerance_does_not_matter() -> None:
-    """What Newton leaves open at the scene's tolerance is a hundredth of what the mesh does."""
-    for case in CASES:
-        tight = displacements(case, replace(DEFAULT, tolerance=1e-8))
-        assert relative_error(displacements(case), tight) < 2e-5
-        loose = displacements(case, FAST)
-        assert relative_error(loose, displacements(case, replace(FAST, tolerance=1e-8))) < 1e-3
+    """What Newton leaves open is far less than what the mesh does."""
+    for level, allowed in ((DEFAULT, 1e-5), (FAST, 5e-4)):
+        tight = displacements(CASES[0], replace(level, tolerance=1e-8))
+        assert relative_error(displacements(CASES[0], level), tight) < allowed
 
 
 # --- stability --------------------------------------------------------------------------------------------
@@ -106,26 +104,28 @@ def _amplification(parameters: TissueParameters) -> float:
     return asymmetry(pulled) / asymmetry(still)
 
 
-WORST_PULLS = [
-    TissueParameters(*material, patch=patch, angle=angle)
-    for material in MATERIALS
-    for patch, angle in ((0, 0.0), (PATCHES - 1, 180.0))
-]
+WORST_PULLS = ((0, 0.0), (PATCHES - 1, 180.0))  # across the wall: they compress one side of it
 
 
-@pytest.mark.parametrize("pull", WORST_PULLS, ids=lambda p: f"nu {p.poisson_ratio}, {p.angle:.0f} degrees")
-def test_worst_pulls_are_stable(pull: TissueParameters) -> None:
-    """Level pulls across the wall compress one side of it, the most of all draws: still no buckling."""
-    assert SCENE.check(SCENE.simulate(pull)) == []
-    assert _amplification(pull) < 12
+@pytest.mark.parametrize(("patch", "angle"), WORST_PULLS)
+@pytest.mark.parametrize("material", MATERIALS, ids=NAMES)
+def test_worst_pulls_are_stable(material: tuple[float, float], patch: int, angle: float) -> None:
+    """The equilibrium stays a minimum of energy."""
+    assert SCENE.check(SCENE.simulate(TissueParameters(*material, patch=patch, angle=angle))) == []
+
+
+def test_disturbances_grow_in_pushes_only() -> None:
+    """At nu = 0, where they grow most: by a factor of 8 in the worst pull, of 1000 in a push."""
+    for patch, angle in WORST_PULLS:
+        assert _amplification(TissueParameters(*MATERIALS[1], patch=patch, angle=angle)) < 12
+    assert _amplification(TissueParameters(*MATERIALS[1], patch=9, angle=-90.0)) > 300
 
 
 @pytest.mark.parametrize("material", MATERIALS, ids=NAMES)
-def test_pushes_buckle(material: tuple[float, float]) -> None:
-    """Why pushes are no part of the scene: what disturbs the wall decides where it goes, and `check` says so."""
+def test_pushes_are_rejected(material: tuple[float, float]) -> None:
+    """What disturbs the wall would decide where it goes."""
     push = TissueParameters(*material, patch=9, angle=-90.0)
     assert any("unstable" in problem for problem in SCENE.check(SCENE.simulate(push)))
-    assert _amplification(push) > 50
 
 
 # --- draws ------------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ def test_extremes_are_valid(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "allowed"),
-    [("nu -0.95", 0.01), ("nu 0.0, twice the pull", 0.015), ("nu 0.49, twice the pull", 0.04)],
+    [("nu 0.0, twice the pull", 0.015), ("nu 0.49, twice the pull", 0.04)],
 )
 def test_extremes_are_right(name: str, allowed: float) -> None:
     """After the whole pull, against the fine mesh."""
