@@ -64,7 +64,7 @@ def test_surface_is_closed_and_outward() -> None:
         turned = np.concatenate([np.roll(mesh.cells, k, axis=1) for k in range(3)])
         following = {a: b for v, a, b in turned.tolist() if v == vertex}
         start = at = next(iter(following))
-        fan = []
+        fan: list[int] = []
         while at != start or not fan:
             fan.append(at)
             at = following[at]
@@ -115,7 +115,9 @@ def test_slab_is_that_of_the_surface(patch: int) -> None:
 
 
 def test_sampling() -> None:
-    draws = [draw(SCENE, "train", index, DATASET_SEED) for index in range(600)]
+    drawn = [draw(SCENE, "train", index, DATASET_SEED) for index in range(600)]
+    draws = [parameters for parameters in drawn if isinstance(parameters, TissueParameters)]
+    assert len(draws) == 600
     assert Counter(d.poisson_ratio for d in draws[:96]) == dict.fromkeys((-0.9, 0.0, 0.49), 32)
     assert {(d.poisson_ratio, d.youngs_modulus) for d in draws} == set(MATERIALS)
     assert {d.patch for d in draws} == set(range(PATCHES))

@@ -1,8 +1,8 @@
 """What the tissue scene leaves out, by how much, and how much there is to infer: the numbers in its card.
 
-Every check holds a measured effect between bounds, so that the card cannot go stale unnoticed; `pytest -s` prints
-what was measured. Errors are
-relative L2 norms of the displacement over the whole path, on the default mesh.
+Every check holds a measured effect between bounds, so that the card cannot go stale unnoticed; `pytest -s`
+prints what was measured. Errors are relative L2 norms of the displacement over the whole path, on the default
+mesh.
 """
 
 from dataclasses import replace
