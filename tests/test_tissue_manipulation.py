@@ -1,10 +1,12 @@
 """The tissue scene, quickly; `validation/` goes deeper."""
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.datasets.trajectory import FIXED, Trajectory
@@ -29,6 +31,13 @@ from m3gn_bench.generators.tissue_manipulation import (
 )
 
 SCENE = TissueManipulation()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """As datasets are made; matrices this small only suffer from more."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="module")
