@@ -155,7 +155,14 @@ class ExplicitSolid(TetrahedralSolid):
     # -- motion ----------------------------------------------------------------------------------------
 
     def run(
-        self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
+        self,
+        positions: Array,
+        velocities: Array,
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: int,
+        first_frame: int = 0,
     ) -> Motion:
         substep = frame_time / substeps
         parts = next(k for k in range(max(1, substeps // CAPTURED), 0, -1) if substeps % k == 0)
@@ -175,7 +182,7 @@ class ExplicitSolid(TetrahedralSolid):
             path[frame], speeds[frame] = self._x.numpy(), self._v.numpy()
             if not np.isfinite(path[frame]).all():
                 raise SolverError(
-                    f"frame {frame}: positions are not finite; {substeps} substeps per frame are too few"
+                    f"frame {first_frame + frame}: positions are not finite; {substeps} substeps per frame are too few"
                 )
         return Motion(path, speeds, lag=substep / 2)
 

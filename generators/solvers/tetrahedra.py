@@ -90,7 +90,14 @@ class TetrahedralSolid:
         self.masses = density * self.nodal_volumes
 
     def run(
-        self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
+        self,
+        positions: Array,
+        velocities: Array,
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: int,
+        first_frame: int = 0,
     ) -> Motion:
         """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
 
@@ -100,6 +107,7 @@ class TetrahedralSolid:
             frames: number of frames to compute.
             frame_time: time between frames [s].
             substeps: of the solver, per frame.
+            first_frame: what to call the state given, in errors.
 
         Raises:
             SolverError: names the first frame whose positions are not finite.

@@ -156,7 +156,14 @@ class VertexBlockDescent(TetrahedralSolid):
             pipeline.collide(self._states[0], self._contacts)
 
     def run(
-        self, positions: Array, velocities: Array, *, frames: int, frame_time: float, substeps: int
+        self,
+        positions: Array,
+        velocities: Array,
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: int,
+        first_frame: int = 0,
     ) -> Motion:
         """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
 
@@ -191,7 +198,7 @@ class VertexBlockDescent(TetrahedralSolid):
             speeds[frame] = self._states[0].particle_qd.numpy()
             if not np.isfinite(path[frame]).all():
                 raise SolverError(
-                    f"frame {frame}: positions are not finite; "
+                    f"frame {first_frame + frame}: positions are not finite; "
                     f"{self.iterations} iterations in {substeps} substeps per frame are too few"
                 )
         return Motion(path, speeds, lag=substep / 2)
