@@ -10,7 +10,6 @@ jump. Source: paper, sections 5 and C; sizes, ratios and numbers follow the desc
 
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from importlib.metadata import version
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from skfem import ElementQuadS2, MeshQuad
 
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.generators.scene import SimulatedWithScikitFem, SingleTask
 from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Solid
@@ -96,7 +96,7 @@ class BlockFidelity:
 
 
 @dataclass(frozen=True)
-class DeformableBlock:
+class DeformableBlock(SingleTask, SimulatedWithScikitFem):
     """The scene. Positions in mm, Young's modulus in Pa, time in s.
 
     Attributes:
@@ -280,18 +280,6 @@ class DeformableBlock:
             replace(parameters, poisson_ratios=(middle, smallest)),
             replace(parameters, poisson_ratios=(middle, largest)),
         )
-
-    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
-        """One task, with all trajectories."""
-        return list(self.tasks)
-
-    def task_size(self, task: str, split: Split, trajectories: int) -> int:
-        """All."""
-        return trajectories
-
-    def simulator_versions(self) -> dict[str, str]:
-        """Versions of scikit-fem, scipy and numpy."""
-        return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
 
 
 def max_force_drop(forces: Array) -> tuple[float, int]:

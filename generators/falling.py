@@ -20,6 +20,7 @@ from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.objects import SoftBody, load_object
+from m3gn_bench.generators.scene import SingleTask
 from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
 
 SIZE = 0.5  # [m], an object's largest extent in its own axes
@@ -71,7 +72,7 @@ class FallFidelity:
 
 
 @dataclass(frozen=True)
-class _FallingObjects:
+class _FallingObjects(SingleTask):
     """What the two scenes share. Positions in m; the floor is z = 0."""
 
     solver: Solver = "explicit"
@@ -232,14 +233,6 @@ class _FallingObjects:
             for end in (0, -1)
         )
         return soft, stiff
-
-    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
-        """One task, of the scene's name."""
-        return list(self.tasks)
-
-    def task_size(self, task: str, split: Split, trajectories: int) -> int:
-        """All of them."""
-        return trajectories
 
     def simulator_versions(self) -> dict[str, str]:
         """Versions of the solver's library, scipy and numpy."""

@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 from importlib import import_module
+from importlib.metadata import version
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -62,6 +63,28 @@ class Scene(Protocol):
     def simulator_versions(self) -> dict[str, str]:
         """Versions of the libraries whose code shapes the numbers."""
         ...
+
+
+class SingleTask:
+    """Part of a scene all of whose trajectories take part in its one task."""
+
+    tasks: ClassVar[tuple[str, ...]]
+
+    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
+        """One task, whatever the split and the material."""
+        return list(self.tasks)
+
+    def task_size(self, task: str, split: Split, trajectories: int) -> int:
+        """All of them."""
+        return trajectories
+
+
+class SimulatedWithScikitFem:
+    """Part of a scene whose solver stands on scikit-fem."""
+
+    def simulator_versions(self) -> dict[str, str]:
+        """Versions of scikit-fem, scipy and numpy."""
+        return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
 
 
 # Imported on demand: a scene loads only the simulator that it needs.

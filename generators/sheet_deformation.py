@@ -8,13 +8,13 @@ thickness, Poisson's ratio and load history follow the description of the origin
 """
 
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from typing import ClassVar
 
 import numpy as np
 
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.generators.scene import SimulatedWithScikitFem
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate
 from m3gn_bench.generators.solvers.quasistatic import load_path
@@ -58,7 +58,7 @@ class SheetFidelity:
 
 
 @dataclass(frozen=True)
-class SheetDeformation:
+class SheetDeformation(SimulatedWithScikitFem):
     """The scene. Positions in mm, moduli in MPa, forces in N; a frame is 1/50 of the load."""
 
     name: ClassVar[str] = "sheet_deformation"
@@ -172,10 +172,6 @@ class SheetDeformation:
         """E cycles with the index, so this needs no simulation."""
         moduli = [YOUNGS_MODULI[i % len(YOUNGS_MODULI)] for i in range(trajectories)]
         return sum(task in self.tasks_of(split, {"youngs_modulus": modulus}) for modulus in moduli)
-
-    def simulator_versions(self) -> dict[str, str]:
-        """Versions of scikit-fem, scipy and numpy."""
-        return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
 
     def plate(self, youngs_modulus: float, refinement: int) -> ClampedPlate:
         """The sheet's plate, each element split into `refinement` parts along either direction."""

@@ -12,7 +12,6 @@ Units are mm, g and s, so forces are in uN and stresses in uN/mm^2 = Pa.
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.metadata import version
 from typing import ClassVar
 
 import numpy as np
@@ -24,6 +23,7 @@ from skfem import Basis, ElementHexS2, MeshHex, MeshHex2
 
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.generators.scene import SimulatedWithScikitFem, SingleTask
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
@@ -102,7 +102,7 @@ class TissueFidelity:
 
 
 @dataclass(frozen=True)
-class TissueManipulation:
+class TissueManipulation(SingleTask, SimulatedWithScikitFem):
     """The scene. Positions in mm, Young's modulus in Pa, time in s."""
 
     name: ClassVar[str] = "tissue_manipulation"
@@ -249,18 +249,6 @@ class TissueManipulation:
             for ratio, modulus in (MATERIALS[0], MATERIALS[1])
         )
         return soft, stiff
-
-    def tasks_of(self, split: Split, material: dict[str, float]) -> list[str]:
-        """There is one task."""
-        return list(self.tasks)
-
-    def task_size(self, task: str, split: Split, trajectories: int) -> int:
-        """All of them."""
-        return trajectories
-
-    def simulator_versions(self) -> dict[str, str]:
-        """Versions of scikit-fem, scipy and numpy."""
-        return {name: version(name) for name in ("scikit-fem", "scipy", "numpy")}
 
 
 @dataclass(frozen=True, eq=False)
