@@ -8,16 +8,18 @@ ground, and of inertia, which is there to make the sudden change of material a s
 jump. Source: paper, sections 5 and C; sizes, ratios and numbers follow the description of the original data.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from skfem import ElementQuadS2, MeshQuad
 
+from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
+from m3gn_bench.generators.errors import GeneratorError
 from m3gn_bench.generators.scene import SimulatedWithScikitFem, SingleTask
 from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
@@ -61,6 +63,8 @@ MAX_STEP = 4.0  # of a node, in steps of the circle
 TRANSIENT = 2  # transitions in which the block finds its new equilibrium after the change of material
 MAX_TRANSIENT_STEP = 0.1 * HEIGHT  # [mm], of a node in those
 
+Plane = Literal["stress", "strain"]
+
 
 @dataclass(frozen=True)
 class BlockParameters:
@@ -103,7 +107,7 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
         plane: "stress" (a thin plate, the benchmark's) or "strain" (a slice of a long bar).
     """
 
-    plane: Literal["stress", "strain"] = "stress"
+    plane: Plane = "stress"
 
     name: ClassVar[str] = "deformable_block"
     dataset_version: ClassVar[str] = "1.0"
@@ -122,6 +126,10 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
         "default": BlockFidelity(8, 1, (16, 8, 8, 4, 4, 4, 2, 2, 2, 2), 1, 1e-5),
         "reference": BlockFidelity(16, 2, (32, 16, 16, 8, 8, 8, 4, 4, 4, 4), 2, 1e-7),
     }
+
+    def __post_init__(self) -> None:
+        if self.plane not in get_args(Plane):
+            raise GeneratorError(unknown_name("plane", self.plane, list(get_args(Plane))))
 
     @property
     def variant(self) -> dict[str, str]:
@@ -176,7 +184,6 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
             for k, points in enumerate(block.surface_points.positions(states))
         ]
         drop, drop_frame = max_force_drop(forces)
-        statistics = dynamics.newton.statistics
         return Trajectory(
             positions=positions.astype(np.float32),
             mesh=block.mesh,
@@ -189,11 +196,7 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
             collider_positions=(centres[:, None] + ring).astype(np.float32),
             collider_edges=np.column_stack([around, (around + 1) % COLLIDER_NODES]).astype(np.int32),
             diagnostics={
-                "factorisations": statistics.factorisations,
-                "evaluations": statistics.evaluations,
-                "shifted_factorisations": statistics.shifted_factorisations,
-                "rejected_steps": statistics.rejected_steps,
-                "bisections": statistics.bisections,
+                **asdict(dynamics.newton.statistics),
                 "min_jacobian": dynamics.min_jacobian,
                 "max_penetration": float(max(depth)),
                 "max_penetration_frame": int(np.argmax(depth)),

@@ -7,7 +7,7 @@ The load's place and sign and Young's modulus vary. Source: paper, sections 5 an
 thickness, Poisson's ratio and load history follow the description of the original Abaqus data.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -110,7 +110,6 @@ class SheetDeformation(SimulatedWithScikitFem):
         else:
             coarse = self.plate(parameters.youngs_modulus, 1)
             nodal_forces = coarse.nodal_values(self._load(coarse, parameters))[self._recorded(coarse)[0]]
-        statistics = newton.statistics
         strains = plate.principal_membrane_strains(states[-1])
         return Trajectory(
             positions=positions.astype(np.float32),
@@ -122,11 +121,7 @@ class SheetDeformation(SimulatedWithScikitFem):
                 "forces": np.array(parameters.forces, dtype=np.float32),
             },
             diagnostics={
-                "factorisations": statistics.factorisations,
-                "evaluations": statistics.evaluations,
-                "shifted_factorisations": statistics.shifted_factorisations,
-                "rejected_steps": statistics.rejected_steps,
-                "bisections": statistics.bisections,
+                **asdict(newton.statistics),
                 "min_principal_strain": float(strains.min()),
                 "max_principal_strain": float(strains.max()),
             },

@@ -10,7 +10,7 @@ the slab's shape is our own.
 Units are mm, g and s, so forces are in uN and stresses in uN/mm^2 = Pa.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import ClassVar
 
@@ -176,7 +176,6 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
                 unstable_frames += not slab.is_stable(law, dynamics.displacement)
 
         path = FRAME * np.arange(self.frames)[:, None] * velocity
-        statistics = newton.statistics
         return Trajectory(
             positions=(surface().rest_positions + displacements).astype(np.float32),
             mesh=surface().mesh,
@@ -190,11 +189,7 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
             },
             collider_positions=(grasp_point(parameters.patch) + path)[:, None].astype(np.float32),
             diagnostics={
-                "factorisations": statistics.factorisations,
-                "evaluations": statistics.evaluations,
-                "shifted_factorisations": statistics.shifted_factorisations,
-                "rejected_steps": statistics.rejected_steps,
-                "bisections": statistics.bisections,
+                **asdict(newton.statistics),
                 "min_jacobian": dynamics.min_jacobian,
                 "max_gripper_force_newton": 1e-6 * float(np.linalg.norm(forces, axis=1).max()),
                 "max_asymmetry_mm": asymmetry(displacements),

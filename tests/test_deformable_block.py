@@ -25,7 +25,7 @@ from m3gn_bench.generators.deformable_block import (
     make_block,
     max_force_drop,
 )
-from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.scene import get_scene
 
 PARAMETERS = BlockParameters(widths=(220.0, 180.0), poisson_ratios=(0.0, 0.49), radius=35.0, start=25.0)
@@ -155,6 +155,11 @@ def test_plane_strain_is_an_option(trajectory: Trajectory) -> None:
     assert scene.check(strained) == []
     # Nothing can move out of the plane, so the block is stiffer and bulges more.
     assert strained.diagnostics["max_contact_force"] > 1.1 * trajectory.diagnostics["max_contact_force"]
+
+
+def test_a_misspelt_plane_is_refused() -> None:
+    with pytest.raises(GeneratorError, match="unknown plane 'sterss'; known: strain, stress"):
+        get_scene("deformable_block", plane="sterss")
 
 
 # --- checks -----------------------------------------------------------------------------------------------

@@ -228,7 +228,7 @@ def test_force_and_stiffness_are_derivatives(solid: Solid, poisson_ratio: float)
     state = potential.contact_state
     assert np.isfinite(energy)
     assert state is not None
-    assert (state.max_penetration > 0.01).all()  # both obstacles are touched
+    assert len(state.touches) == 2  # both obstacles are touched
     assert (ahead - behind) / (2 * step) == pytest.approx(force @ direction, rel=1e-6)
     change = (force_ahead - force_behind) / (2 * step)
     product = dense(potential.assembler, potential.stiffness(x)) @ direction

@@ -95,13 +95,11 @@ class ContactState(NamedTuple):
         energy: of the penalty.
         force: its derivative with respect to the displacement, shape [dofs]; None without contact.
         resultants: force of the body on each obstacle, shape [obstacles, d].
-        max_penetration: of each obstacle, 0 without contact, shape [obstacles].
     """
 
     energy: float
     force: Array | None
     resultants: Array
-    max_penetration: Array
     touches: tuple[_Touch, ...]
 
 
@@ -169,7 +167,6 @@ class PenaltyContact:
         x = positions.reshape(-1, d)
         energy = 0.0
         resultants = np.zeros((len(self.obstacles), d))
-        max_penetration = np.zeros(len(self.obstacles))
         touches = []
         traction: Array | None = None
         for k, obstacle in enumerate(self.obstacles):
@@ -187,13 +184,12 @@ class PenaltyContact:
             push = pressure[:, None] * normal
             traction[inside] -= push
             resultants[k] = -push.sum(0)
-            max_penetration[k] = depth.max()
             touches.append(_Touch(inside, normal, stiffness, pressure * curvature))
         force: Array | None = None
         if traction is not None:
             nodal = boundary.values_transposed @ traction.reshape(facets, points, d)
             force = np.bincount(boundary.dofs.ravel(), nodal.ravel(), len(u)).astype(np.float64, copy=False)
-        return ContactState(energy, force, resultants, max_penetration, tuple(touches))
+        return ContactState(energy, force, resultants, tuple(touches))
 
     def add_stiffness(self, state: ContactState, matrices: Array) -> None:
         """Add the second derivative of the energy to the element matrices [elements, n, n] of the solid."""

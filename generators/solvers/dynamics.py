@@ -167,10 +167,9 @@ class ImplicitDynamics:
 
     Attributes:
         time: reached.
-        displacement, velocity: of all degrees of freedom then, shape [dofs].
+        displacement: of all degrees of freedom then, shape [dofs].
         contact_forces: of the body on each obstacle then.
         min_jacobian: smallest J at a Gauss point in any step so far.
-        max_penetration: deepest of any contact point in any step so far.
     """
 
     def __init__(
@@ -195,7 +194,6 @@ class ImplicitDynamics:
         self._before: _Motion | None = None
         self._factored_step = 0.0  # size of the step for which the kept factorisation was made
         self.min_jacobian = 1.0
-        self.max_penetration = 0.0
 
     @property
     def time(self) -> float:
@@ -214,11 +212,6 @@ class ImplicitDynamics:
         if state is None:
             raise ValueError("no contact, or no step yet")
         return state.resultants
-
-    @property
-    def velocity(self) -> Array:
-        """Shape [dofs]."""
-        return self._now.velocity
 
     def restart(self) -> None:
         """Begin a new history: call it where material or load jump. The next step is backward Euler."""
@@ -281,10 +274,6 @@ class ImplicitDynamics:
         u = potential.expand(x)
         self._before, self._now = now, _Motion(end, u, rate * (u - position))
         self.min_jacobian = min(self.min_jacobian, potential.min_jacobian)
-        if potential.contact_state is not None:
-            self.max_penetration = max(
-                self.max_penetration, float(potential.contact_state.max_penetration.max())
-            )
 
     def _history(self, h: float) -> tuple[float, Array, Array]:
         """The formula d/dt y = rate (y_new - history(y)): its rate and the histories of u and v."""
