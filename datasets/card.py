@@ -61,12 +61,15 @@ def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
                 continue
         diagnostics: dict[str, list[float]] = {}
         steps = Moments()
+        reach = 0.0
         sizes: dict[str, tuple[int, int]] = {}
         for key in keys:
             trajectory = read_trajectory(file, key)
             for name, value in trajectory.diagnostics.items():
                 diagnostics.setdefault(name, []).append(value)
             steps.add(np.diff(trajectory.positions / metadata.scale_length, axis=0))
+            scaled = (trajectory.positions - np.array(metadata.scale_centre)) / metadata.scale_length
+            reach = max(reach, float(np.abs(scaled).max()))
             mesh = trajectory.mesh
             sizes[trajectory.tags.get("object", "")] = (len(mesh.rest_positions), len(mesh.cells))
     rows = [
@@ -86,9 +89,14 @@ def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
             "movement per step, scaled",
             f"mean {_vector(steps.mean)}, std {_vector(steps.variance**0.5)}",
         ),
+        ("largest coordinate of a node, scaled", f"{reach:.3g}"),
         ("rejected draws", "; ".join(f"{r.key}: {r.reason}" for r in metadata.rejections) or "0"),
         ("CPU time per trajectory", _range(diagnostics.pop("cpu_seconds"), " s")),
-        *((name.replace("_", " "), _range(values, "")) for name, values in diagnostics.items()),
+        *(
+            (name.replace("_", " "), _range(values, ""))
+            for name, values in diagnostics.items()
+            if not name.endswith("_frame")  # says where, in an error; its mean says nothing
+        ),
         *further,
         ("file size", f"{path.stat().st_size / 1e6:.1f} MB"),
         ("machine", metadata.machine),

@@ -58,8 +58,8 @@ class Rejection(Record):
 class Metadata(Record):
     """Root attributes of a dataset file.
 
-    Units are named, e.g. length_unit "mm". Models see (positions - scale_centre) / scale_length, which maps
-    the scene into [-1, 1].
+    Units are named, e.g. length_unit "mm". Models see (positions - scale_centre) / scale_length, which makes
+    coordinates of the order of one; each card states the largest.
     """
 
     schema_version: int = SCHEMA_VERSION

@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from m3gn_bench.console import Report, table
-from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.errors import BenchError, DatasetError
 from m3gn_bench.version import __version__
 
 # Modules that need torch or a simulator are imported inside the commands, so that --help stays instant.
@@ -135,13 +135,16 @@ def list_command(as_json: bool) -> None:
     help="Folder.  [default: as --data]",
 )
 @click.option("--fidelity", default="default", show_default=True, help="fast, default or reference.")
-@click.option("--solver", default=None, help="Falling objects: explicit (default) or newton-vbd.")
+@click.option(
+    "--solver", default=None, help="Falling teddy, mixed objects: explicit (default) or newton-vbd."
+)
 @click.option(
     "--mesh",
     type=click.Path(path_type=Path, dir_okay=False),
     default=None,
-    help="Falling objects: drop the object in this file instead (a closed surface, or tetrahedra).",
+    help="Falling teddy: drop the object in this file instead (a closed surface, or tetrahedra), scaled to 0.5 m.",
 )
+@click.option("--plane", default=None, help="Deformable block: stress (default) or strain.")
 @click.option("--split", "splits", multiple=True, help="Only this split (may be given several times).")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=None, help="Of the dataset.  [default: the leaderboard's]"
@@ -156,6 +159,7 @@ def generate(
     fidelity: str,
     solver: str | None,
     mesh: Path | None,
+    plane: str | None,
     splits: tuple[str, ...],
     seed: int | None,
     workers: int,
@@ -169,15 +173,15 @@ def generate(
     from m3gn_bench.tasks import TASKS
 
     report = Report(as_json)
-    options: dict[str, Any] = {"solver": solver}
-    if mesh is not None:
+    name = TASKS[scene_name].scene if scene_name in TASKS else scene_name
+    options = {key: value for key, value in (("solver", solver), ("plane", plane)) if value is not None}
+    if mesh is None:
+        scene = get_scene(name, **options)
+    else:
         from m3gn_bench.generators.objects import read_or_keep_object
 
-        options["mesh"] = read_or_keep_object(mesh, out or data)
-    scene = get_scene(
-        TASKS[scene_name].scene if scene_name in TASKS else scene_name,
-        **{name: value for name, value in options.items() if value is not None},
-    )
+        get_scene(name, **options, mesh=None)  # complains before the work if there is no such scene or option
+        scene = get_scene(name, **options, mesh=read_or_keep_object(mesh, out or data))
     with report.progress(f"simulating {scene.name}") as on_progress:
         made = generate_dataset(
             scene,
@@ -322,11 +326,12 @@ def card(file: Path, as_json: bool) -> None:
     """Write the numbers of a dataset FILE into its scene's card, and record its hashes."""
     from m3gn_bench.datasets.card import CARDS, fill, numbers
     from m3gn_bench.datasets.file import open_file, read_metadata
-    from m3gn_bench.datasets.recorded import record
+    from m3gn_bench.datasets.recorded import record, require_own
     from m3gn_bench.datasets.writer import write_bytes_atomically
     from m3gn_bench.generators.material_effect import material_effect
     from m3gn_bench.generators.scene import get_scene
 
+    require_own(file)
     with open_file(file) as opened:
         scene = get_scene(read_metadata(opened).scene)
     effect = ("softest against stiffest material, mean squared difference, scaled", material_effect(scene))
@@ -355,7 +360,12 @@ def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) ->
 
     names = scene_names()
     scene = get_scene(scene_name or names[date.today().toordinal() % len(names)])
-    read_record(scene.name)  # complain before the work, not after it
+    recorded = read_record(scene.name)  # complain before the work, not after it
+    if tier not in recorded.hashes or recorded.dataset_version != scene.dataset_version:
+        raise DatasetError(
+            f"recorded of {scene.name} are version {recorded.dataset_version}, tiers {', '.join(recorded.hashes)}; "
+            f"this generator makes version {scene.dataset_version}, and tier {tier} was asked for"
+        )
     report = Report(as_json)
     with TemporaryDirectory() as folder, report.progress(f"simulating {scene.name}") as on_progress:
         made = generate_dataset(scene, tier, Path(folder), workers=workers, on_progress=on_progress)
@@ -363,8 +373,8 @@ def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) ->
     agreement = (
         "bit-identical to the record"
         if outcome.identical
-        else f"not bit-identical; largest difference {outcome.largest_difference:.1e} of the scene's half-width "
-        f"(allowed {outcome.tolerance:g}, for processors that round differently)"
+        else f"not bit-identical; largest difference {outcome.largest_difference:.1e} in scaled units in "
+        f"{outcome.trajectories} trajectories (allowed {outcome.tolerance:g}, for processors that round differently)"
     )
     report.finish(
         outcome.model_dump(mode="json") | {"ok": outcome.ok, "content_hash": made.content_hash},

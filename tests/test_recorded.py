@@ -15,12 +15,30 @@ from m3gn_bench.datasets.card import Moments
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory, stored_hashes
 from m3gn_bench.datasets.recorded import compare, probe, read_record, record
+from m3gn_bench.datasets.schema import SMALL_TIERS, trajectory_key
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.scene import scene_names
 
 
+@pytest.fixture(scope="module")
+def quick_file(smoke_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As many trajectories as the quick tier has; beyond the smoke tier they repeat themselves."""
+    folder = tmp_path_factory.mktemp("quick")
+    with open_file(smoke_file) as file:
+        metadata = read_metadata(file).model_copy(update={"tier": "quick"})
+        shards = {}
+        for split, size in SMALL_TIERS["quick"].items():
+            for index in range(size):
+                key = trajectory_key(split, index)
+                trajectory = read_trajectory(file, trajectory_key(split, index % SMALL_TIERS["smoke"][split]))
+                shards[key] = folder / f"{key}.shard"
+                write_shard(shards[key], key, trajectory, metadata)
+    merge_shards(folder / "quick.h5", shards, metadata, lambda split, material: ["sheet_deformation"])
+    return folder / "quick.h5"
+
+
 def altered(source: Path, folder: Path, change: float, **metadata: Any) -> Path:
-    """A copy of a dataset whose coordinates differ by up to `change` of the scene's half-width."""
+    """A copy of a dataset whose coordinates differ by `change` of the scene's half-width."""
     with open_file(source) as file:
         described = read_metadata(file).model_copy(update=metadata)
         shards = {}
@@ -34,20 +52,38 @@ def altered(source: Path, folder: Path, change: float, **metadata: Any) -> Path:
     return path
 
 
-def test_the_same_file_is_identical(smoke_file: Path, tmp_path: Path) -> None:
-    record(smoke_file, tmp_path)
-    outcome = compare(smoke_file, tmp_path)
-    assert (outcome.ok, outcome.identical, outcome.largest_difference) == (True, True, 0.0)
-    assert outcome.trajectories == 16
+def test_the_same_file_is_identical(quick_file: Path, smoke_file: Path, tmp_path: Path) -> None:
+    """Also a smaller tier, since tiers are prefixes of one another."""
+    record(quick_file, tmp_path)
+    for file, trajectories in ((quick_file, 96), (smoke_file, 16)):
+        outcome = compare(file, tmp_path)
+        assert (outcome.ok, outcome.identical, outcome.largest_difference) == (True, True, 0.0)
+        assert outcome.trajectories == trajectories
 
 
-@pytest.mark.parametrize(("change", "ok"), [(2e-6, True), (1e-3, False)])
-def test_another_file_is_measured(smoke_file: Path, tmp_path: Path, change: float, ok: bool) -> None:
-    record(smoke_file, tmp_path)
+@pytest.mark.parametrize(("change", "ok"), [(2e-6, True), (1e-3, False), (np.nan, False)])
+def test_another_file_is_measured(
+    quick_file: Path, smoke_file: Path, tmp_path: Path, change: float, ok: bool
+) -> None:
+    record(quick_file, tmp_path)
     outcome = compare(altered(smoke_file, tmp_path, change), tmp_path)
     assert not outcome.identical
-    assert outcome.largest_difference == pytest.approx(change, rel=0.2)
+    assert outcome.largest_difference == pytest.approx(change, rel=0.2, nan_ok=True)
     assert outcome.ok == ok
+
+
+@pytest.mark.parametrize("change", [{"fidelity": "fast"}, {"variant": {"solver": "other"}}, {"seed": 1}])
+def test_only_the_benchmarks_own_data_are_recorded(
+    smoke_file: Path, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    with pytest.raises(DatasetError, match="not the benchmark's own dataset"):
+        record(altered(smoke_file, tmp_path, 0.0, **change), tmp_path / "records")
+    assert not (tmp_path / "records").exists()
+
+
+def test_less_than_the_quick_tier_is_not_recorded(smoke_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="whole quick tier"):
+        record(smoke_file, tmp_path)
 
 
 def test_probe_covers_the_last_frame(smoke_file: Path) -> None:
@@ -62,9 +98,9 @@ def test_probe_covers_the_last_frame(smoke_file: Path) -> None:
 
 @pytest.mark.parametrize("change", [{"dataset_version": "9.9"}, {"scene": "unheard_of"}])
 def test_what_is_not_recorded_cannot_be_compared(
-    smoke_file: Path, tmp_path: Path, change: dict[str, str]
+    quick_file: Path, smoke_file: Path, tmp_path: Path, change: dict[str, str]
 ) -> None:
-    record(smoke_file, tmp_path)
+    record(quick_file, tmp_path)
     with pytest.raises(DatasetError, match=r"recorded of"):
         compare(altered(smoke_file, tmp_path, 0.0, **change), tmp_path)
 
@@ -87,9 +123,9 @@ def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
     assert len(found.probes) == 96
 
 
-def test_reproduce_command(smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reproduce_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From nothing, against a record of other data: exit code 1. (CI runs it against the good ones.)"""
-    record(altered(smoke_file, tmp_path, 1e-2), tmp_path)
+    record(altered(quick_file, tmp_path, 1e-2), tmp_path)
     monkeypatch.setattr(recorded, "FOLDER", tmp_path)
     arguments = ["reproduce", "sheet_deformation", "--tier", "smoke", "--workers", "1", "--json"]
     outcome = CliRunner().invoke(cli, arguments)
@@ -97,3 +133,13 @@ def test_reproduce_command(smoke_file: Path, tmp_path: Path, monkeypatch: pytest
     found = json.loads(outcome.stdout)
     assert (found["ok"], found["identical"]) == (False, False)
     assert found["largest_difference"] == pytest.approx(1e-2, rel=1e-3)
+
+
+def test_reproduce_complains_before_the_work(
+    quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(quick_file, tmp_path)
+    monkeypatch.setattr(recorded, "FOLDER", tmp_path)
+    outcome = CliRunner().invoke(cli, ["reproduce", "sheet_deformation", "--tier", "paper"])
+    assert isinstance(outcome.exception, DatasetError)
+    assert "tiers smoke, quick" in str(outcome.exception)
