@@ -42,7 +42,7 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def trajectory() -> Trajectory:
-    """The softest tissue pulled to the upper left."""
+    """Nearly incompressible tissue pulled to the upper left."""
     return SCENE.simulate(TissueParameters(*MATERIALS[2], patch=5, angle=130.0), "fast")
 
 
