@@ -67,6 +67,12 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
     [
         (["generate", "bending"], ["scene 'bending'", "known: deformable_block, falling_teddy,"]),
         (["generate", TASK, "--solver", "explicit"], [f"{TASK} has no options", "'solver'"]),
+        (["generate", "falling_teddy", "--solver", "x"], ["solver 'x'", "known: explicit, newton-vbd"]),
+        (["generate", "mixed_objects", "--mesh", "x.stl"], ["of mixed_objects 'mesh'", "known: solver"]),
+        (["generate", "falling_teddy", "--mesh", "absent.stl"], ["absent.stl", "no such file"]),
+        (["generate", "deformable_block", "--plane", "flat"], ["plane 'flat'", "known: strain, stress"]),
+        (["reproduce", "bending"], ["scene 'bending'", "known: deformable_block, falling_teddy,"]),
+        (["reproduce", TASK, "--tier", "huge"], ["tier huge"]),
         (["generate", TASK, "--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
         (["generate", TASK, "--fidelity", "best"], ["fidelity 'best'", "known: default, fast, reference"]),
         (["generate", TASK, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),

@@ -2,13 +2,13 @@
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from m3gn_bench.datasets.file import content_hash, open_file
@@ -51,8 +51,52 @@ def test_killed_generation_goes_on(scene: str, tmp_path: Path) -> None:
         assert content_hash(file, "smoke", ["test"]) == made["content_hash"]
 
 
-def test_workers_stay_below_a_gibibyte() -> None:
-    """Of all the processes that the tests above started."""
-    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    print(f"{largest / 2**20:.0f} MiB")
-    assert 0 < largest < 2**30
+MEASURE = """
+import json, resource, sys, time
+from threadpoolctl import threadpool_limits
+from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.generators.generate import draw
+from m3gn_bench.generators.scene import get_scene
+
+scene, fidelity, draws = get_scene(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+seconds = []
+with threadpool_limits(1):
+    for index in range(draws):
+        start = time.process_time()
+        trajectory = scene.simulate(draw(scene, "test", index, DATASET_SEED), fidelity)
+        seconds.append(time.process_time() - start)
+        assert scene.check(trajectory) == []
+print(json.dumps([seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024]))
+"""
+
+
+def measured(scene: str, fidelity: str, draws: int) -> tuple[list[float], int]:
+    """CPU seconds of each simulation, and the largest memory [bytes], of a process of its own."""
+    arguments = [sys.executable, "-c", MEASURE, scene, fidelity, str(draws)]
+    done = subprocess.run(arguments, stdout=subprocess.PIPE, text=True, check=True)
+    seconds, memory = json.loads(done.stdout)
+    print(f"{scene}, {fidelity}: {np.mean(seconds[1:] or seconds):.2f} s, {memory / 2**20:.0f} MiB")
+    return seconds, memory
+
+
+@pytest.mark.parametrize(
+    ("scene", "allowed"),
+    [
+        ("sheet_deformation", 1.2),
+        ("deformable_block", 0.3),
+        ("tissue_manipulation", 1.0),
+        ("falling_teddy", 1.0),
+        ("mixed_objects", 2.0),
+    ],
+)
+def test_time_and_memory_of_a_trajectory(scene: str, allowed: float) -> None:
+    """Mean CPU seconds on one core, without the first (which loads and compiles); below a gibibyte."""
+    seconds, memory = measured(scene, "default", 13)
+    assert np.mean(seconds[1:]) < allowed
+    assert memory < 2**30
+
+
+def test_memory_of_a_refined_body() -> None:
+    """Eight times as many tetrahedra."""
+    _, memory = measured("falling_teddy", "reference", 1)
+    assert memory < 2**30
