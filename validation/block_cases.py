@@ -18,6 +18,7 @@ from m3gn_bench.generators.deformable_block import (
     FRAME,
     HEIGHT,
     POISSON_RATIOS,
+    TRAPEZOIDS,
     YOUNGS_MODULUS,
     BlockParameters,
     DeformableBlock,
@@ -56,9 +57,9 @@ def relative_error(found: Array, reference: Array) -> float:
 
 
 def draws_with(poisson_ratio: float, count: int) -> list[BlockParameters]:
-    """Random parameters whose second ratio is this one, each with another trapezoid."""
-    start = len(POISSON_RATIOS) ** 2 * POISSON_RATIOS.index(poisson_ratio)
-    return [draw(start + k) for k in range(count)]
+    """Random parameters whose second ratio is this one, each with another trapezoid (of which there are nine)."""
+    cycle = [draw(index) for index in range(len(TRAPEZOIDS) * len(POISSON_RATIOS))]
+    return [parameters for parameters in cycle if parameters.poisson_ratios[1] == poisson_ratio][:count]
 
 
 # -- a flat punch, without contact ------------------------------------------------------------------------
