@@ -10,7 +10,6 @@ from tissue_cases import CASES
 
 from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.generators.deformable_block import BASE, HEIGHT, DeformableBlock, make_block
-from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.falling import FallingTeddy
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
@@ -33,12 +32,7 @@ def test_sheet_under_twice_the_force(youngs_modulus: float, forces: tuple[float,
     """Valid, or refused for a reason: never in silence beyond what the material law can bear."""
     scene = SheetDeformation()
     parameters = case(youngs_modulus, (2 * forces[0], 2 * forces[1]))
-    try:
-        trajectory = scene.simulate(parameters)
-    except SolverError as error:
-        assert "frame" in str(error)
-        print(f"E {youngs_modulus}: {error}")
-        return
+    trajectory = scene.simulate(parameters)
     problems = scene.check(trajectory)
     print(f"E {youngs_modulus}, {forces}: {problems or 'valid'}")
     assert np.isfinite(trajectory.positions).all()
@@ -48,17 +42,12 @@ def test_sheet_under_twice_the_force(youngs_modulus: float, forces: tuple[float,
 
 
 def test_block_pressed_in_a_single_step() -> None:
-    """40 mm in one step of 27 frames: solved, by bisections if need be, or an error that says where."""
+    """40 mm in one step of 27 frames: solved, by bisections if need be."""
     parameters = replace(draw_block(1), poisson_ratios=(0.0, 0.49))
     block = make_block(parameters.widths, 8)
     dynamics, disc = DeformableBlock().prepare(parameters, block.body, block.contact_points, 1e-5)
     end = 40.0 / parameters.speed
-    try:
-        dynamics.advance(end, 1, "frame 1 of 1")
-    except SolverError as error:
-        assert "frame 1 of 1" in str(error)
-        print(error)
-        return
+    dynamics.advance(end, 1, "frame 1 of 1")
     print(f"{dynamics.newton.statistics.bisections} bisections")
     depth = BASE + HEIGHT - (disc.centre(end)[1] - disc.radius)
     assert depth == pytest.approx(40.0)
