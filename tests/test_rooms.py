@@ -98,6 +98,9 @@ def test_a_forbidden_import_is_seen(path: str, source: str) -> None:
         ("m3gn_bench.cli", {"torch", "skfem", "h5py", "numpy"}),  # --help is instant
         ("m3gn_bench.datasets.file", {"torch", "skfem"}),
         ("m3gn_bench.generators.generate", {"torch", "skfem"}),  # a scene brings its own simulator
+        ("m3gn_bench.generators.falling", {"torch", "skfem", "warp", "newton", "trimesh", "meshio"}),
+        ("m3gn_bench.generators.deformable_block", {"torch", "warp"}),
+        ("m3gn_bench.generators.tissue_manipulation", {"torch", "warp"}),
         ("m3gn_bench.evaluation, m3gn_bench.checkpoint, m3gn_bench.sources", {"skfem"}),
     ],
 )
