@@ -33,6 +33,7 @@ from m3gn_bench.generators.meshes.geometry import (
     is_closed,
     is_consistently_wound,
     normalised,
+    reference_step,
     surface_nodes_first,
 )
 
@@ -54,6 +55,8 @@ SMALLEST_CELL = 1e-12  # volume over the cube of the largest extent, below which
 SMALLEST_EXTENT = 1e-3  # over the largest
 SAME_PLACE = 1e-7  # over the largest extent
 SMALLEST_VOLUME = 1e-9  # over the cube of the largest extent, below which a surface encloses nothing
+SMALLEST_STEP = 2e-5  # [s], of `reference_step`; it asks for 25 times the work of our own objects
+OWN_STEP, OWN_SUBSTEPS = 5e-4, 20  # the smallest of our own objects, and what it makes of a frame of 0.01 s
 
 # Red refinement: the edges' midpoints are the nodes 4..9 of a cell. Four cells keep a corner each; the
 # octahedron between them is cut along one of its diagonals, around which the other midpoints form a ring.
@@ -155,9 +158,12 @@ def write_object(body: SoftBody, path: Path) -> None:
 
     Raises:
         GeneratorError: meshio is missing or does not write this format.
+        DatasetError: the operating system refuses (.npz).
     """
-    if path.suffix == ".npz":
-        np.savez_compressed(path, **body.arrays())  # type: ignore[arg-type]
+    if _is_npz(path):
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **body.arrays())  # type: ignore[arg-type]
+        write_bytes_atomically(path, buffer.getvalue())
         return
     meshio = _optional("meshio", path)
     try:
@@ -170,7 +176,8 @@ def read_object(path: Path) -> SoftBody:
     """A user's own object, scaled so that its largest extent is 1, its centre of mass at the origin.
 
     A tetrahedral mesh (.npz by `write_object`, or .vtu, .vtk, .msh, ... by meshio) is used as it is: nodes are
-    reordered, those of the surface first, and unused ones dropped; cells that are all inverted are turned. A
+    reordered, those of the surface first, and unused ones dropped; cells that are all inverted are turned. It is
+    refused where slivers would make the simulation 25 times as long as that of our own objects. A
     closed surface (.stl, .obj, .ply, .off, .glb, or triangles in a format of meshio's) is remeshed to at most
     350 nodes and filled with tetrahedra. That is not deterministic: read a surface once, in one process, and
     keep the result with `write_object` where the same data are to be made again.
@@ -181,7 +188,7 @@ def read_object(path: Path) -> SoftBody:
     """
     if not path.is_file():
         raise GeneratorError(f"{path}: there is no such file; give a tetrahedral mesh or a closed surface")
-    if path.suffix.lower() == ".npz":
+    if _is_npz(path):
         stored = _read_npz(path)
         return _from_tetrahedra(path, stored.vertices, stored.tetrahedra)
     if path.suffix.lower() in SURFACE_FORMATS:
@@ -201,14 +208,11 @@ def read_or_keep_object(path: Path, folder: Path) -> SoftBody:
     Raises:
         GeneratorError: see `read_object`.
     """
-    if path.suffix == ".npz" or not path.is_file():
+    if _is_npz(path) or not path.is_file():
         return read_object(path)
     kept = folder / f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}.npz"
     if not kept.is_file():
-        body = read_object(path)
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **body.arrays())  # type: ignore[arg-type]
-        write_bytes_atomically(kept, buffer.getvalue())
+        write_object(read_object(path), kept)
     return replace(read_object(kept), name=path.stem)
 
 
@@ -218,6 +222,10 @@ def _optional(library: str, path: Path) -> Any:
         return importlib.import_module(library)
     except ImportError as error:
         raise GeneratorError(f"{path} needs {library}: pip install 'm3gn-bench[mesh]'") from error
+
+
+def _is_npz(path: Path) -> bool:
+    return path.suffix.lower() == ".npz"
 
 
 def _read_npz(path: Path) -> SoftBody:
@@ -300,6 +308,15 @@ def _require_shape(path: Path, vertices: Floats, cells: Indices, kind: str) -> N
         )
 
 
+def _require_stable_step(path: Path, step: float, advice: str) -> None:
+    """A user's object whose simulation takes not unreasonably longer than that of our own."""
+    if step < SMALLEST_STEP:
+        raise GeneratorError(
+            f"{path}: its worst tetrahedron allows the solver steps of {step:.1g} s only, which are about "
+            f"{OWN_SUBSTEPS * OWN_STEP / step:.0f} per frame, while our own objects need {OWN_SUBSTEPS}; {advice}"
+        )
+
+
 def _from_tetrahedra(path: Path, vertices: Floats, tetrahedra: Indices) -> SoftBody:
     """The body of a user's tetrahedral mesh, checked."""
     _require_shape(path, vertices, tetrahedra, "tetrahedra")
@@ -330,7 +347,13 @@ def _from_tetrahedra(path: Path, vertices: Floats, tetrahedra: Indices) -> SoftB
             f"{path} has {surface_nodes} surface nodes, at most {MAX_SURFACE_NODES} are allowed; mesh it more "
             "coarsely, or give its surface as .stl, which is then done for you"
         )
-    return SoftBody(path.stem, normalised(vertices, tetrahedra), tetrahedra, surface_nodes)
+    vertices = normalised(vertices, tetrahedra)
+    _require_stable_step(
+        path,
+        reference_step(vertices, tetrahedra),
+        "mesh it more evenly, without slivers and thin walls, or give its surface as .stl, which is then done for you",
+    )
+    return SoftBody(path.stem, vertices, tetrahedra, surface_nodes)
 
 
 def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
@@ -369,6 +392,7 @@ def _from_surface(path: Path, vertices: Floats, triangles: Indices) -> SoftBody:
             "remove what is finer than about a twentieth of its size, or give a tetrahedral mesh"
         )
     best = max(usable, key=lambda candidate: candidate.stable_step)
+    _require_stable_step(path, best.stable_step, "thicken thin walls and blunt sharp edges")
     return SoftBody(path.stem, best.vertices, best.tetrahedra, best.surface_nodes)
 
 

@@ -7,9 +7,11 @@ from typing import Protocol
 
 import numpy as np
 import pytest
+from skfem import MeshTet
 
 from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, SPLITS, Metadata, Tier, trajectory_key
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TETRA, Mesh, Trajectory
+from m3gn_bench.datasets.validator import cell_volumes
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.generate import generate
 from m3gn_bench.generators.scene import get_scene
@@ -33,6 +35,17 @@ TETRA_METADATA = Metadata(
     scale_length=2.0,
 )
 Change = Callable[[str, Trajectory], Trajectory]
+
+
+def box_of_tetrahedra(
+    size: tuple[float, float, float], cells: tuple[int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and tetrahedra of positive volume, six to each cell of a box; its lower corner is the origin."""
+    mesh = MeshTet.init_tensor(*[np.linspace(0, s, n + 1) for s, n in zip(size, cells, strict=True)])
+    vertices, tetrahedra = mesh.p.T.copy(), mesh.t.T.astype(np.int32)
+    inverted = cell_volumes(vertices, tetrahedra, VTK_TETRA) < 0
+    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
+    return vertices, tetrahedra
 
 
 class TetraWriter(Protocol):
@@ -60,6 +73,8 @@ def tetra_trajectory(key: str) -> Trajectory:
         material={"stiffness": float(rng.uniform(1, 2)), "density": 1.5},
         loads={"push": rng.normal(size=(5, 3)).astype(np.float32)},
         collider_positions=rng.normal(size=(TETRA_METADATA.frames, 2, 3)).astype(np.float32),
+        collider_edges=np.array([[0, 1]], np.int32),
+        tags={"object": "wedge"},
         diagnostics={"cpu_seconds": 0.1, "iterations": 7.0},
     )
 

@@ -47,6 +47,7 @@ def from_arrays(arrays: dict[str, np.ndarray], original: Trajectory) -> Trajecto
         mesh=Mesh(**{**mesh, "cell_type": int(mesh["cell_type"])}),  # type: ignore[arg-type]
         loads={"push": arrays["loads/push"]},
         collider_positions=arrays["collider_positions"],
+        collider_edges=arrays["collider_edges"],
     )
 
 
@@ -79,6 +80,10 @@ def test_content_hash_sees_names_shapes_and_absence(tetra: Trajectory) -> None:
         replace(tetra, loads={"push": push.reshape(3, 5)}),
         replace(tetra, loads={}),
         replace(tetra, collider_positions=None),
+        replace(tetra, collider_edges=None),
+        replace(tetra, tags={}),
+        replace(tetra, tags={"object": "edge"}),
+        replace(tetra, tags={"thing": "wedge"}),
         replace(
             tetra, material={"stiffness": tetra.material["density"], "density": tetra.material["stiffness"]}
         ),
@@ -101,7 +106,8 @@ def assert_identical(read: Trajectory, written: Trajectory) -> None:
     for name, array in expected.items():
         assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape), name
         assert found[name].tobytes() == array.tobytes(), name
-    assert (read.material, read.diagnostics) == (written.material, written.diagnostics)
+    assert (read.material, read.tags) == (written.material, written.tags)
+    assert read.diagnostics == written.diagnostics
 
 
 def test_round_trip_is_bit_exact(tmp_path: Path, tetra: Trajectory, tetra_metadata: Metadata) -> None:

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import box_of_tetrahedra
 from scipy.spatial.transform import Rotation
-from skfem import MeshTet
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
@@ -14,19 +14,13 @@ from m3gn_bench.generators.solvers.tetrahedra import lame_constants
 MATERIAL = {"density": 1000.0, "youngs_modulus": 2e5, "poisson_ratio": 0.4}
 
 
-def block(cells: int = 2, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
-    """A cube of tetrahedra with positive volumes; its lower corner is the origin."""
-    mesh = MeshTet.init_tensor(*[np.linspace(0, size, cells + 1)] * 3)
-    vertices, tetrahedra = mesh.p.T.copy(), mesh.t.T.astype(np.int32)
-    corners = vertices[tetrahedra]
-    inverted = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
-    return vertices, tetrahedra
+def cube(cells: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    return box_of_tetrahedra((0.3,) * 3, (cells,) * 3)
 
 
 def solid(**options: Any) -> ExplicitSolid:
     """A cube of soft material."""
-    return ExplicitSolid(*block(options.pop("cells", 2)), **{**MATERIAL, **options})
+    return ExplicitSolid(*cube(options.pop("cells", 2)), **{**MATERIAL, **options})
 
 
 def deformed(vertices: np.ndarray, amount: float = 0.1) -> np.ndarray:
@@ -160,6 +154,48 @@ def test_highest_frequency(nodal_pressure: bool, poisson_ratio: float) -> None:
     assert body.highest_frequency == pytest.approx(np.sqrt(largest), rel=2e-3)
 
 
+def test_highest_frequency_of_a_single_tetrahedron() -> None:
+    """Nodal pressure is the cell's own, and K is small enough to write down."""
+    E, nu, density = 3.0, 0.25, 2.0
+    mu, lam = lame_constants(E, nu)
+    gradients = np.array([[-1.0, -1, -1], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    volume, mass = 1 / 6, density / 24
+    stiffness = volume * (
+        lam * np.einsum("ai,bj->aibj", gradients, gradients)
+        + mu * np.einsum("aj,bi->aibj", gradients, gradients)
+        + mu * np.einsum("ak,bk,ij->aibj", gradients, gradients, np.eye(3))
+    ).reshape(12, 12)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    body = ExplicitSolid(
+        corners,
+        np.array([[0, 1, 2, 3]], np.int32),
+        density=density,
+        youngs_modulus=E,
+        poisson_ratio=nu,
+    )
+    assert body.highest_frequency == pytest.approx(
+        np.sqrt(np.linalg.eigvalsh(stiffness / mass).max()), rel=1e-5
+    )
+
+
+def test_highest_frequency_scales_as_a_wave_does() -> None:
+    """With the speed of sound over the size."""
+
+    def frequency(size: float, youngs_modulus: float, density: float) -> float:
+        body = ExplicitSolid(
+            *box_of_tetrahedra((size,) * 3, (3, 3, 3)),
+            density=density,
+            youngs_modulus=youngs_modulus,
+            poisson_ratio=0.3,
+        )
+        return body.highest_frequency
+
+    reference = frequency(1.0, 1e6, 1000.0)
+    assert frequency(2.0, 1e6, 1000.0) == pytest.approx(reference / 2, rel=1e-4)
+    assert frequency(1.0, 4e6, 1000.0) == pytest.approx(2 * reference, rel=1e-4)
+    assert frequency(1.0, 1e6, 4000.0) == pytest.approx(reference / 2, rel=1e-4)
+
+
 def test_beyond_the_stable_step_the_frame_is_named() -> None:
     body = solid(youngs_modulus=1e9, viscosity=0.0)
     velocity = np.tile([0.3, 0.0, -3.0], (body.nodes, 1))
@@ -184,7 +220,7 @@ def test_parameters_out_of_range(change: dict[str, float], message: str) -> None
 
 
 def test_inverted_tetrahedra_are_refused() -> None:
-    vertices, tetrahedra = block()
+    vertices, tetrahedra = cube()
     tetrahedra[7] = tetrahedra[7][[1, 0, 2, 3]]
     with pytest.raises(ValueError, match="tetrahedron 7"):
         ExplicitSolid(vertices, tetrahedra, **MATERIAL)

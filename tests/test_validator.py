@@ -114,9 +114,12 @@ FILE_DEFECTS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     ),
     "other chunks": ("E003", GROUP, store_otherwise(f"{GROUP}/positions", chunks=(1, 5, 3))),
     "positions in float64": ("E004", GROUP, replace_array(f"{GROUP}/positions", np.float64)),
+    "collider edges in int64": ("E004", GROUP, replace_array(f"{GROUP}/collider_edges", np.int64)),
     "wrong number of frames": ("E004", "/trajectories/test_00000", set_attribute("frames", 5)),
     "number changed": ("E009", GROUP, replace_array(f"{GROUP}/positions", lambda array: array + 1)),
     "material changed": ("E009", GROUP, set_attribute("density", 1.25, f"{GROUP}/material")),
+    "tag changed": ("E009", GROUP, set_attribute("object", "edge", f"{GROUP}/tags")),
+    "tags taken out": ("E009", GROUP, delete(f"{GROUP}/tags")),
     "hash of trajectory": ("E009", GROUP, set_attribute("content_hash", "0" * 64, GROUP)),
     "hash of file": ("E009", "/", set_attribute("content_hash", "0" * 64)),
     "trajectory taken out": ("E009", "/", delete(GROUP)),
@@ -201,6 +204,9 @@ CONTENT_DEFECTS: dict[str, tuple[str, Change]] = {
     ),
     "node too large": ("E006", with_value("mesh/cells", (1, 3), 5)),
     "node negative": ("E006", with_value("mesh/cells", (0, 0), -1)),
+    "collider's node too large": ("E006", with_value("collider_edges", (0, 1), 2)),
+    "collider's node negative": ("E006", with_value("collider_edges", (0, 0), -1)),
+    "edges of no collider": ("E006", Mutation(lambda t: replace(t, collider_positions=None))),
     "cell type unknown": ("E006", Mutation(lambda t: replace(t, mesh=replace(t.mesh, cell_type=12)))),
     "cell type of other corners": (
         "E006",
@@ -215,6 +221,10 @@ CONTENT_DEFECTS: dict[str, tuple[str, Change]] = {
     "node types for other nodes": (
         "E004",
         Mutation(lambda t: replace(t, mesh=replace(t.mesh, node_type=t.mesh.node_type[1:]))),
+    ),
+    "collider edges of three nodes": (
+        "E004",
+        Mutation(lambda t: replace(t, collider_edges=np.array([[0, 1, 0]], np.int32))),
     ),
     "collider in fewer frames": (
         "E004",

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import box_of_tetrahedra
 from scipy.spatial.transform import Rotation
-from skfem import MeshTet
 
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
@@ -17,18 +17,7 @@ needs_newton = pytest.mark.skipif(
     importlib.util.find_spec("newton") is None, reason="newton is not installed"
 )
 
-
-def beam(size: tuple[float, float, float], cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A box of tetrahedra with positive volumes; its lower corner is the origin."""
-    mesh = MeshTet.init_tensor(*[np.linspace(0, s, n + 1) for s, n in zip(size, cells, strict=True)])
-    vertices, tetrahedra = mesh.p.T.copy(), mesh.t.T.astype(np.int32)
-    corners = vertices[tetrahedra]
-    inverted = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
-    return vertices, tetrahedra
-
-
-CUBE = beam((0.3, 0.3, 0.3), (2, 2, 2))
+CUBE = box_of_tetrahedra((0.3, 0.3, 0.3), (2, 2, 2))
 
 
 def solid(**options: Any) -> VertexBlockDescent:

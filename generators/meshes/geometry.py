@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import LinearOperator, eigsh
+
+from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
@@ -105,49 +106,16 @@ def normalised(vertices: Floats, tetrahedra: Indices) -> Floats:
     return (vertices - centre) / extent
 
 
-def stable_time_step(
-    vertices: Floats,
-    tetrahedra: Indices,
-    *,
-    youngs_modulus: float,
-    poisson_ratio: float,
-    density: float,
-) -> float:
-    """2 / omega_max [s] of the body at rest: beyond it, undamped central differences diverge.
-
-    Linear tetrahedra whose pressure is averaged over the nodes, lumped masses. omega_max^2 is the largest
-    eigenvalue of M^-1/2 K M^-1/2, which is applied cell by cell and never assembled.
-
-    Args:
-        vertices: [m], shape [nodes, 3].
-        tetrahedra: positive volumes, shape [cells, 4].
-        youngs_modulus: [Pa].
-        poisson_ratio: below 0.5.
-        density: [kg/m^3].
-    """
-    mu = youngs_modulus / (2 * (1 + poisson_ratio))
-    lame = youngs_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))
-    nodes, corners = len(vertices), tetrahedra.ravel()
-    edges = vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]]
-    volumes = np.linalg.det(edges) / 6
-    gradients = np.empty((len(tetrahedra), 4, 3))
-    gradients[:, 1:] = np.linalg.inv(edges).transpose(0, 2, 1)
-    gradients[:, 0] = -gradients[:, 1:].sum(1)
-    nodal_volumes = np.bincount(corners, np.repeat(volumes / 4, 4), nodes)
-    root_masses = np.sqrt(density * nodal_volumes)[:, None]
-
-    def scaled_stiffness(flat: Floats) -> Floats:
-        displacements = flat.reshape(nodes, 3) / root_masses
-        slope = np.einsum("cai,caj->cij", displacements[tetrahedra], gradients)
-        divergence = np.trace(slope, axis1=1, axis2=2)
-        nodal = np.bincount(corners, np.repeat(volumes * divergence / 4, 4), nodes) / nodal_volumes
-        stress = mu * (slope + slope.transpose(0, 2, 1))
-        stress[:, [0, 1, 2], [0, 1, 2]] += lame * nodal[tetrahedra].mean(1)[:, None]
-        forces = np.einsum("cij,caj->cai", stress * volumes[:, None, None], gradients).reshape(-1, 3)
-        gathered = np.stack([np.bincount(corners, forces[:, axis], nodes) for axis in range(3)], 1)
-        return (gathered / root_masses).ravel()
-
-    operator = LinearOperator((3 * nodes, 3 * nodes), matvec=scaled_stiffness, dtype=np.float64)
-    start = np.random.default_rng(0).normal(size=3 * nodes)
-    largest = eigsh(operator, k=1, which="LA", v0=start, tol=1e-6, return_eigenvectors=False)
-    return float(2 / np.sqrt(largest[0]))
+def reference_step(vertices: Floats, tetrahedra: Indices) -> float:
+    """2 / omega_max [s], beyond which undamped central differences diverge, of an object of size 1 scaled to
+    0.5 m, E = 1 MPa, nu = 0.3, 1000 kg/m^3."""
+    body = TetrahedralSolid(
+        0.5 * vertices,
+        tetrahedra,
+        density=1000.0,
+        youngs_modulus=1e6,
+        poisson_ratio=0.3,
+        gravity=0.0,
+        nodal_pressure=True,
+    )
+    return 2 / body.highest_frequency

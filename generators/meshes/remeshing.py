@@ -27,7 +27,7 @@ from m3gn_bench.generators.meshes.geometry import (
     euler_characteristic,
     is_closed,
     normalised,
-    stable_time_step,
+    reference_step,
     surface_nodes_first,
 )
 
@@ -49,8 +49,8 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A mesh whose surface nodes come first, centred, of largest extent 1, and its stable step [s] at
-    E = 1 MPa, nu = 0.3, 1000 kg/m^3 and a size of 0.5 m."""
+    """A mesh whose surface nodes come first, centred, of largest extent 1, and its stable step [s]
+    (see `reference_step`)."""
 
     recipe: Recipe
     vertices: Floats
@@ -64,11 +64,6 @@ def recipes(
 ) -> list[Recipe]:
     """All combinations."""
     return [Recipe(*values) for values in itertools.product(surface_nodes, edge_factors, envelopes)]
-
-
-def reference_step(vertices: Floats, tetrahedra: Indices) -> float:
-    """Stable step [s] of an object of size 1 scaled to 0.5 m, E = 1 MPa, nu = 0.3, 1000 kg/m^3."""
-    return stable_time_step(0.5 * vertices, tetrahedra, youngs_modulus=1e6, poisson_ratio=0.3, density=1000.0)
 
 
 def cluster_surface(vertices: Floats, triangles: Indices, nodes: int) -> tuple[Floats, Indices]:

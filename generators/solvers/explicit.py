@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.explicit_kernels import (
@@ -77,17 +76,12 @@ class ExplicitSolid(TetrahedralSolid):
             youngs_modulus=youngs_modulus,
             poisson_ratio=poisson_ratio,
             gravity=gravity,
+            fixed=fixed,
             nodal_pressure=nodal_pressure,
         )
         if viscosity < 0 or friction < 0:
             raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
         self.viscosity, self.friction, self.floor, self.device = viscosity, friction, floor, device
-        self._gradients = np.empty((self.cells, 4, 3))  # of the shape functions
-        self._gradients[:, 1:] = self.inverse_edges
-        self._gradients[:, 0] = -self.inverse_edges.sum(1)
-        self._inverse_masses = 1 / self.masses
-        if fixed is not None:
-            self._inverse_masses[fixed] = 0.0
 
         # Corners sorted by node: what a node gathers, always in the same order.
         flat = self.tetrahedra.ravel()
@@ -97,7 +91,7 @@ class ExplicitSolid(TetrahedralSolid):
         self._rest = self._upload(self.inverse_edges, wp.mat33d)
         self._volumes = self._upload(self.volumes, wp.float64)
         self._nodal_volumes = self._upload(self.nodal_volumes, wp.float64)
-        self._inverse_mass = self._upload(self._inverse_masses, wp.float64)
+        self._inverse_mass = self._upload(self.inverse_masses, wp.float64)
         self._incident = self._upload(incident, wp.int32)
         self._start = self._upload(start, wp.int32)
         self._cell_volumes = wp.zeros(self.cells, dtype=wp.float64, device=device)
@@ -112,14 +106,9 @@ class ExplicitSolid(TetrahedralSolid):
     # -- the stable step -------------------------------------------------------------------------------
 
     @cached_property
-    def highest_frequency(self) -> float:
-        """Largest natural frequency omega_max at rest [rad/s]."""
-        return float(np.sqrt(self._largest_eigenvalue(self.mu, self.lam)))
-
-    @cached_property
     def highest_damping_rate(self) -> float:
         """Largest rate at which viscosity damps a velocity field at rest [1/s]."""
-        return self._largest_eigenvalue(self.viscosity, 0.0) if self.viscosity else 0.0
+        return self.largest_eigenvalue(self.viscosity, 0.0) if self.viscosity else 0.0
 
     def substeps(self, frame_time: float, courant: float) -> int:
         """Substeps per frame that keep leapfrog at `courant` times its limit of stability at rest."""
@@ -127,30 +116,6 @@ class ExplicitSolid(TetrahedralSolid):
         omega, r = self.highest_frequency, self.highest_damping_rate
         limit = (np.sqrt(r**2 + 4 * omega**2) - r) / omega**2
         return max(MIN_SUBSTEPS, int(np.ceil(frame_time / (courant * limit))))
-
-    def _largest_eigenvalue(self, mu: float, lam: float) -> float:
-        """Of M^-1 K at rest, where K has the Lame constants mu and lam."""
-        root = np.sqrt(np.repeat(self._inverse_masses, 3))
-
-        def product(flat: Array) -> Array:
-            displacement = (root * flat.ravel()).reshape(-1, 3)
-            return root * self._linear_force(displacement, mu, lam).ravel()
-
-        size = 3 * self.nodes
-        operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
-        start = np.random.default_rng(0).normal(size=size)
-        return float(eigsh(operator, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
-
-    def _linear_force(self, displacement: Array, mu: float, lam: float) -> Array:
-        gradient = displacement[self.tetrahedra].transpose(0, 2, 1) @ self._gradients
-        stress = mu * (gradient + gradient.transpose(0, 2, 1))
-        dilatation = np.trace(gradient, axis1=1, axis2=2)
-        if self.nodal_pressure:
-            nodal = self.gather(np.repeat(self.volumes * dilatation / 4, 4)) / self.nodal_volumes
-            dilatation = nodal[self.tetrahedra].mean(1)
-        stress[:, [0, 1, 2], [0, 1, 2]] += lam * dilatation[:, None]
-        forces = self._gradients @ (stress * self.volumes[:, None, None])
-        return np.stack([self.gather(forces[:, :, axis].ravel()) for axis in range(3)], axis=1)
 
     # -- motion ----------------------------------------------------------------------------------------
 
@@ -193,8 +158,8 @@ class ExplicitSolid(TetrahedralSolid):
         self._launch_forces()
         by_corner = self._forces.numpy()
         forces = np.stack([self.gather(by_corner[:, axis]) for axis in range(3)], axis=1)
-        gravity = np.where(self._inverse_masses > 0, -self.gravity, 0.0)
-        return forces * self._inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
+        gravity = np.where(self.inverse_masses > 0, -self.gravity, 0.0)
+        return forces * self.inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
 
     def _launch_forces(self) -> None:
         body = [self._tetrahedra, self._rest, self._volumes]

@@ -10,9 +10,11 @@ volume ratio averaged over each node (average nodal pressure: Bonet and Burton, 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 Array = NDArray[np.float64]
 
@@ -55,6 +57,7 @@ class TetrahedralSolid:
         youngs_modulus: [Pa].
         poisson_ratio: nu in [0, 0.5).
         gravity: [m/s^2].
+        fixed: nodes that do not move.
         nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
 
     Raises:
@@ -70,6 +73,7 @@ class TetrahedralSolid:
         youngs_modulus: float,
         poisson_ratio: float,
         gravity: float,
+        fixed: NDArray[np.integer] | None = None,
         nodal_pressure: bool,
     ) -> None:
         self.mu, self.lam = lame_constants(youngs_modulus, poisson_ratio)
@@ -88,6 +92,12 @@ class TetrahedralSolid:
         self.inverse_edges = np.linalg.inv(edges)
         self.nodal_volumes = self.gather(np.repeat(self.volumes / 4, 4))
         self.masses = density * self.nodal_volumes
+        self.inverse_masses = 1 / self.masses
+        if fixed is not None:
+            self.inverse_masses[fixed] = 0.0
+        self.gradients = np.empty((self.cells, 4, 3))  # of the shape functions
+        self.gradients[:, 1:] = self.inverse_edges
+        self.gradients[:, 0] = -self.inverse_edges.sum(1)
 
     def run(
         self,
@@ -118,6 +128,24 @@ class TetrahedralSolid:
         """Sum values of the cells' corners [cells * 4] at the nodes [nodes]."""
         return np.asarray(np.bincount(self.tetrahedra.ravel(), corner_values, self.nodes))
 
+    @cached_property
+    def highest_frequency(self) -> float:
+        """Largest natural frequency omega_max at rest [rad/s]."""
+        return float(np.sqrt(self.largest_eigenvalue(self.mu, self.lam)))
+
+    def largest_eigenvalue(self, mu: float, lam: float) -> float:
+        """Of M^-1 K at rest, where K has the Lame constants mu and lam; fixed nodes have an infinite mass."""
+        root = np.sqrt(np.repeat(self.inverse_masses, 3))
+
+        def product(flat: Array) -> Array:
+            displacement = (root * flat.ravel()).reshape(-1, 3)
+            return root * self._linear_force(displacement, mu, lam).ravel()
+
+        size = 3 * self.nodes
+        operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
+        start = np.random.default_rng(0).normal(size=size)
+        return float(eigsh(operator, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
+
     def volume_ratios(self, positions: Array) -> Array:
         """J of every tetrahedron, shape [cells]; negative where one is inverted."""
         return np.asarray(np.linalg.det(self._deformation_gradients(positions)))
@@ -146,6 +174,17 @@ class TetrahedralSolid:
                 self.gravity * float(self.masses @ earlier[:, 2]),
             )
         return energies, ratios
+
+    def _linear_force(self, displacement: Array, mu: float, lam: float) -> Array:
+        gradient = displacement[self.tetrahedra].transpose(0, 2, 1) @ self.gradients
+        stress = mu * (gradient + gradient.transpose(0, 2, 1))
+        dilatation = np.trace(gradient, axis1=1, axis2=2)
+        if self.nodal_pressure:
+            nodal = self.gather(np.repeat(self.volumes * dilatation / 4, 4)) / self.nodal_volumes
+            dilatation = nodal[self.tetrahedra].mean(1)
+        stress[:, [0, 1, 2], [0, 1, 2]] += lam * dilatation[:, None]
+        forces = self.gradients @ (stress * self.volumes[:, None, None])
+        return np.stack([self.gather(forces[:, :, axis].ravel()) for axis in range(3)], axis=1)
 
     def _deformation_gradients(self, positions: Array) -> Array:
         corners = positions[self.tetrahedra]

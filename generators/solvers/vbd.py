@@ -100,6 +100,7 @@ class VertexBlockDescent(TetrahedralSolid):
             youngs_modulus=youngs_modulus,
             poisson_ratio=poisson_ratio,
             gravity=gravity,
+            fixed=fixed,
             nodal_pressure=False,
         )
         if viscosity < 0 or friction < 0:
@@ -128,11 +129,9 @@ class VertexBlockDescent(TetrahedralSolid):
             add_surface_mesh_edges=False,
             particle_radius=FLOOR_SKIN,
         )
-        self._free = np.ones(self.nodes, dtype=bool)
-        if fixed is not None:
-            self._free[fixed] = False
-            for node in np.flatnonzero(~self._free):
-                builder.particle_mass[node] = 0.0
+        self._free = self.inverse_masses > 0
+        for node in np.flatnonzero(~self._free):
+            builder.particle_mass[node] = 0.0
         builder.color()
         self._model = builder.finalize(device=device)
         self._model.soft_contact_ke = FLOOR_STIFFNESS
