@@ -13,7 +13,7 @@ atomics, so the result does not depend on the order of execution. The same code 
 """
 
 from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from m3gn_bench.generators.solvers.explicit_kernels import (
     nodal_pressures,
 )
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions, TetrahedralSolid
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
 CAPTURED = 50  # substeps per recorded graph: long enough to hide the launch, short enough to record fast
@@ -38,16 +38,9 @@ class ExplicitSolid(TetrahedralSolid):
     Args:
         vertices: stress-free positions [m], shape [nodes, 3].
         tetrahedra: node indices, positively oriented, shape [cells, 4].
-        density: [kg/m^3].
-        youngs_modulus: [Pa].
-        poisson_ratio: nu in [0, 0.5).
-        viscosity: eta [Pa s].
-        friction: Coulomb's coefficient of the floor.
-        gravity: [m/s^2].
-        floor: whether there is one.
         nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
-        fixed: nodes that do not move.
         device: of Warp, "cpu" or "cuda:0".
+        options: see `TetrahedralSolid`.
 
     Raises:
         ValueError: a parameter out of its physical range, or a tetrahedron without volume.
@@ -58,30 +51,12 @@ class ExplicitSolid(TetrahedralSolid):
         vertices: Array,
         tetrahedra: NDArray[np.int32],
         *,
-        density: float,
-        youngs_modulus: float,
-        poisson_ratio: float,
-        viscosity: float = 0.0,
-        friction: float = 0.0,
-        gravity: float = 9.81,
-        floor: bool = True,
         nodal_pressure: bool = True,
-        fixed: NDArray[np.integer] | None = None,
         device: str = "cpu",
+        **options: Unpack[SolidOptions],
     ) -> None:
-        super().__init__(
-            vertices,
-            tetrahedra,
-            density=density,
-            youngs_modulus=youngs_modulus,
-            poisson_ratio=poisson_ratio,
-            gravity=gravity,
-            fixed=fixed,
-            nodal_pressure=nodal_pressure,
-        )
-        if viscosity < 0 or friction < 0:
-            raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
-        self.viscosity, self.friction, self.floor, self.device = viscosity, friction, floor, device
+        super().__init__(vertices, tetrahedra, nodal_pressure=nodal_pressure, **options)
+        self.device = device
 
         # Corners sorted by node: what a node gathers, always in the same order.
         flat = self.tetrahedra.ravel()

@@ -11,6 +11,7 @@ volume ratio averaged over each node (average nodal pressure: Bonet and Burton, 
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Required, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,21 @@ class Motion:
     lag: float
 
 
+class SolidOptions(TypedDict, total=False):
+    """What every solver takes; see `TetrahedralSolid`."""
+
+    density: Required[float]
+    youngs_modulus: Required[float]
+    poisson_ratio: Required[float]
+    viscosity: float
+    friction: float
+    gravity: float
+    floor: bool
+    fixed: NDArray[np.integer] | None
+
+
 class TetrahedralSolid:
-    """A soft solid on tetrahedra.
+    """A soft solid on tetrahedra, and the rigid floor z = 0 that it may fall on.
 
     Args:
         vertices: stress-free positions [m], shape [nodes, 3].
@@ -56,7 +70,10 @@ class TetrahedralSolid:
         density: [kg/m^3].
         youngs_modulus: [Pa].
         poisson_ratio: nu in [0, 0.5).
+        viscosity: eta [Pa s].
+        friction: Coulomb's coefficient of the floor.
         gravity: [m/s^2].
+        floor: whether there is one.
         fixed: nodes that do not move.
         nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
 
@@ -72,14 +89,20 @@ class TetrahedralSolid:
         density: float,
         youngs_modulus: float,
         poisson_ratio: float,
-        gravity: float,
+        viscosity: float = 0.0,
+        friction: float = 0.0,
+        gravity: float = 9.81,
+        floor: bool = True,
         fixed: NDArray[np.integer] | None = None,
         nodal_pressure: bool,
     ) -> None:
         self.mu, self.lam = lame_constants(youngs_modulus, poisson_ratio)
         if density <= 0:
             raise ValueError(f"density must be positive, not {density}")
-        self.gravity, self.nodal_pressure = gravity, nodal_pressure
+        if viscosity < 0 or friction < 0:
+            raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
+        self.density, self.viscosity, self.friction = density, viscosity, friction
+        self.gravity, self.floor, self.nodal_pressure = gravity, floor, nodal_pressure
         self.vertices = np.asarray(vertices, dtype=np.float64)
         self.tetrahedra = np.asarray(tetrahedra, dtype=np.int32)
         self.nodes, self.cells = len(self.vertices), len(self.tetrahedra)

@@ -39,13 +39,14 @@ gain energy in the impact (more than 1 % of it within a frame), the third does n
 import importlib.util
 import logging
 from types import ModuleType
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions, TetrahedralSolid
 from m3gn_bench.generators.solvers.vbd_kernels import set_velocities
 
 FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 500 N sinks 0.05 mm into the skin
@@ -61,16 +62,9 @@ class VertexBlockDescent(TetrahedralSolid):
     Args:
         vertices: stress-free positions [m], shape [nodes, 3].
         tetrahedra: node indices, positively oriented, shape [cells, 4].
-        density: [kg/m^3].
-        youngs_modulus: [Pa].
-        poisson_ratio: nu in [0, 0.5).
-        viscosity: eta [Pa s].
-        friction: Coulomb's coefficient of the floor.
-        gravity: [m/s^2].
-        floor: whether there is one.
-        fixed: nodes that do not move.
         iterations: sweeps over the nodes in each substep.
         device: of Warp, "cpu" or "cuda:0".
+        options: see `TetrahedralSolid`.
 
     Raises:
         GeneratorError: Newton is not installed.
@@ -82,38 +76,19 @@ class VertexBlockDescent(TetrahedralSolid):
         vertices: Array,
         tetrahedra: NDArray[np.int32],
         *,
-        density: float,
-        youngs_modulus: float,
-        poisson_ratio: float,
-        viscosity: float = 0.0,
-        friction: float = 0.0,
-        gravity: float = 9.81,
-        floor: bool = True,
-        fixed: NDArray[np.integer] | None = None,
         iterations: int,
         device: str = "cpu",
+        **options: Unpack[SolidOptions],
     ) -> None:
-        super().__init__(
-            vertices,
-            tetrahedra,
-            density=density,
-            youngs_modulus=youngs_modulus,
-            poisson_ratio=poisson_ratio,
-            gravity=gravity,
-            fixed=fixed,
-            nodal_pressure=False,
-        )
-        if viscosity < 0 or friction < 0:
-            raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
+        super().__init__(vertices, tetrahedra, nodal_pressure=False, **options)
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, not {iterations}")
         newton = _newton()
-        self.viscosity, self.friction, self.floor = viscosity, friction, floor
         self.iterations, self.device = iterations, device
 
-        builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
-        if floor:
-            surface = newton.ModelBuilder.ShapeConfig(ke=FLOOR_STIFFNESS, kd=0.0, mu=friction)
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, -self.gravity))
+        if self.floor:
+            surface = newton.ModelBuilder.ShapeConfig(ke=FLOOR_STIFFNESS, kd=0.0, mu=self.friction)
             builder.add_ground_plane(cfg=surface)
         builder.add_soft_mesh(
             pos=wp.vec3(0.0, 0.0, 0.0),
@@ -122,10 +97,10 @@ class VertexBlockDescent(TetrahedralSolid):
             vel=wp.vec3(0.0, 0.0, 0.0),
             vertices=self.vertices.tolist(),
             indices=self.tetrahedra.ravel().tolist(),
-            density=density,
+            density=self.density,
             k_mu=self.mu,
             k_lambda=self.lam,
-            k_damp=viscosity / 2,
+            k_damp=self.viscosity / 2,
             add_surface_mesh_edges=False,
             particle_radius=FLOOR_SKIN,
         )
@@ -136,7 +111,7 @@ class VertexBlockDescent(TetrahedralSolid):
         self._model = builder.finalize(device=device)
         self._model.soft_contact_ke = FLOOR_STIFFNESS
         self._model.soft_contact_kd = 0.0
-        self._model.soft_contact_mu = friction
+        self._model.soft_contact_mu = self.friction
         self._solver = newton.solvers.SolverVBD(
             self._model,
             iterations=iterations,
@@ -148,7 +123,7 @@ class VertexBlockDescent(TetrahedralSolid):
         self._states = self._model.state(), self._model.state()
         self._control = self._model.control()
         self._contacts = None
-        if floor:
+        if self.floor:
             # Every node may touch the floor, always at the same height: found once, for all steps.
             pipeline = newton.CollisionPipeline(self._model, soft_contact_gap=ANYWHERE)
             self._contacts = pipeline.contacts()
