@@ -495,8 +495,8 @@ def _description(trajectory: Trajectory, metadata: Metadata) -> str:
     parts = [f"{name} {value}" for name, value in trajectory.tags.items()]
     rank = {name: number for number, name in enumerate(SYMBOLS)}
     for name, value in sorted(trajectory.material.items(), key=lambda item: rank.get(item[0], len(rank))):
-        unit = metadata.material_units.get(name, "")
-        parts.append(f"{SYMBOLS.get(name, name)} = {value:.3g}{'' if unit in ('', '1') else f' {unit}'}")
+        unit = metadata.material_units.get(name, "1")
+        parts.append(f"{SYMBOLS.get(name, name)} = {value:.3g}{'' if unit == '1' else f' {unit}'}")
     if len(metadata.time_unit) > LONG_UNIT:
         parts.append(f"t: {metadata.time_unit}")
     return ", ".join(parts).replace("_", " ")

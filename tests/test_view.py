@@ -64,7 +64,7 @@ def ball() -> Trajectory:
 
 def metadata_of(tetra_metadata: Metadata, scene: str, dimension: int) -> Metadata:
     """Metadata under a scene's name, whose look is then used."""
-    units = {"youngs_modulus": "Pa", "poisson_ratio": ""}
+    units = {"youngs_modulus": "Pa", "poisson_ratio": "1"}
     changes = {"scene": scene, "material_units": units, "load_units": {}, "scale_centre": (0.0,) * dimension}
     return tetra_metadata.model_copy(update=changes)
 
@@ -212,6 +212,12 @@ def test_near_triangles_hide_far_ones(tetra_metadata: Metadata) -> None:
     assert (middle([0, 1]) == middle([1, 0])).all()
     red, _, blue = middle([0, 1])
     assert blue > red + 30  # dark blue, not the pale yellow of the triangle behind
+
+
+def test_heading_names_object_and_material(tetra_metadata: Metadata) -> None:
+    made = Picture(ball(), metadata_of(tetra_metadata, "mixed_objects", 3), Look(), "height", "a title")
+    nu = picture.SYMBOLS["poisson_ratio"]
+    assert made.heading == ["a title", f"object octahedron, E = 3.2e+05 Pa, {nu} = 0.49"]
 
 
 def test_colours_have_the_right_numbers(tetra_metadata: Metadata) -> None:
