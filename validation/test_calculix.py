@@ -5,13 +5,11 @@ neither Kirchhoff's hypothesis nor the interpolation with the benchmark's plate.
 a static step and the same dead load; its linear elastic law in Green-Lagrange strain is the same law.
 """
 
-import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from calculix import final_displacements, needs_calculix, run_calculix
 from sheet_cases import CENTRES, OPPOSITE, SAME, at_recorded_nodes, case, displacements, relative_error
 from skfem import Basis, ElementQuadS2, MeshQuad
 
@@ -20,9 +18,7 @@ from m3gn_bench.generators.solvers.sparse import Array
 
 CELLS_PER_SIDE = 28  # two per recorded cell
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("ccx") is None, reason="CalculiX (ccx) isn't installed: install Debian's calculix-ccx"
-)
+pytestmark = needs_calculix
 
 
 def _shell_basis() -> Basis:
@@ -69,42 +65,14 @@ def _deck(basis: Basis, youngs_modulus: float, nodal_forces: Array) -> str:
     return "\n".join(lines)
 
 
-def _run(folder: Path, deck: str) -> str:
-    """Run CalculiX on one thread; the printed results, or a failure with the end of its log."""
-    (folder / "sheet.inp").write_text(deck)
-    run = subprocess.run(
-        ["ccx", "sheet"],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    log = run.stdout + run.stderr
-    ended_well = run.returncode == 0 and "Job finished" in log and "*ERROR" not in log
-    assert ended_well, f"CalculiX failed with exit status {run.returncode}:\n{log[-2000:]}"
-    return (folder / "sheet.dat").read_text()
-
-
-def _final_displacements(results: str, nodes: int) -> Array:
-    """The last table "displacements (vx,vy,vz) for set ALL and time T", shape [nodes, 3]."""
-    title, *lines = results[results.rindex("displacements") :].splitlines()
-    time = float(title.split()[-1])
-    assert time == 1.0, f"CalculiX stopped at load fraction {time}"
-    table = np.array([line.split() for line in lines if line.strip()], dtype=float)
-    assert np.array_equal(table[:, 0], np.arange(1, nodes + 1)), "CalculiX left nodes out"
-    return table[:, 1:]
-
-
 @pytest.mark.parametrize(
     ("youngs_modulus", "forces"), [(30.0, SAME), (100.0, SAME), (1000.0, SAME), (100.0, OPPOSITE)]
 )
 def test_full_load(tmp_path: Path, youngs_modulus: float, forces: tuple[float, float]) -> None:
     """At full load the recorded nodes are displaced as in CalculiX, within 2 % (relative L2)."""
     basis = _shell_basis()
-    results = _run(tmp_path, _deck(basis, youngs_modulus, _nodal_forces(basis, forces)))
-    theirs = at_recorded_nodes(basis.doflocs.T, _final_displacements(results, basis.N))
+    results = run_calculix(tmp_path, _deck(basis, youngs_modulus, _nodal_forces(basis, forces)))
+    theirs = at_recorded_nodes(basis.doflocs.T, final_displacements(results, basis.N))
     ours = displacements(case(youngs_modulus, forces))[-1]
     error = relative_error(ours, theirs)
     assert error < 0.02, f"off by {error:.2%}, at most {np.abs(ours - theirs).max():.3f} mm"

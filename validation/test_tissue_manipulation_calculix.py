@@ -7,13 +7,11 @@ whole pull can be compared. The two other materials are compared where strains a
 difference must shrink in proportion to the pull, as that of the two laws does.
 """
 
-import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from calculix import final_displacements, needs_calculix, run_calculix
 from tissue_cases import CASES, relative_error
 
 from m3gn_bench.generators.solvers.dynamics import ImplicitDynamics, IncrementalPotential
@@ -35,9 +33,7 @@ C3D20 = np.array(
     + [(*c, 0) for c in _CORNERS]
 )
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("ccx") is None, reason="CalculiX (ccx) isn't installed: install Debian's calculix-ccx"
-)
+pytestmark = needs_calculix
 
 
 def _ours(parameters: TissueParameters, distance: float) -> tuple[Slab, Array, Array]:
@@ -98,40 +94,17 @@ def _deck(slab: Slab, parameters: TissueParameters, distance: float) -> str:
     return "\n".join(lines)
 
 
-def _run(folder: Path, deck: str) -> str:
-    """Run CalculiX on one thread; the printed results, or a failure with the end of its log."""
-    (folder / "tissue.inp").write_text(deck)
-    run = subprocess.run(
-        ["ccx", "tissue"],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    log = run.stdout + run.stderr
-    ended_well = run.returncode == 0 and "Job finished" in log and "*ERROR" not in log
-    assert ended_well, f"CalculiX failed with exit status {run.returncode}:\n{log[-2000:]}"
-    return (folder / "tissue.dat").read_text()
-
-
 def _theirs(results: str, nodes: int) -> tuple[Array, Array]:
     """Displacements [nodes, 3] at the end of the step, and the total force on the gripper's nodes."""
-    title, _, table = results[results.rindex("displacements") :].partition("\n")
-    assert float(title.split()[-1]) == 1.0, f"CalculiX stopped at load fraction {title.split()[-1]}"
-    rows = [line.split() for line in table.splitlines() if line.strip()][:nodes]
-    values = np.array(rows, dtype=float)
-    assert np.array_equal(values[:, 0], np.arange(1, nodes + 1)), "CalculiX left nodes out"
     force = results[results.rindex("total force") :].splitlines()[2].split()
-    return values[:, 1:], np.array(force, dtype=float)
+    return final_displacements(results, nodes), np.array(force, dtype=float)
 
 
 def _differences(folder: Path, case: int, distance: float) -> tuple[float, float]:
     """Relative differences of the displacements of all nodes (L2) and of the gripper's force."""
     parameters = CASES[case]
     slab, ours, force = _ours(parameters, distance)
-    theirs, their_force = _theirs(_run(folder, _deck(slab, parameters, distance)), len(ours))
+    theirs, their_force = _theirs(run_calculix(folder, _deck(slab, parameters, distance)), len(ours))
     return relative_error(ours, theirs), relative_error(force, their_force)
 
 
