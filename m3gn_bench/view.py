@@ -95,7 +95,9 @@ def view(
     try:
         from m3gn_bench.picture import Picture
     except ImportError as error:
-        raise ConfigError(f"pictures need matplotlib and pillow ({error}); pip install 'm3gn-bench[plot]'") from error
+        raise ConfigError(
+            f"pictures need matplotlib and pillow ({error}); pip install 'm3gn-bench[plot]'"
+        ) from error
 
     with open_file(file) as opened:
         metadata = read_metadata(opened)
