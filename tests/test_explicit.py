@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
+from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import lame_constants
 
 MATERIAL = {"density": 1000.0, "youngs_modulus": 2e5, "poisson_ratio": 0.4}
@@ -194,6 +195,16 @@ def test_highest_frequency_scales_as_a_wave_does() -> None:
     assert frequency(2.0, 1e6, 1000.0) == pytest.approx(reference / 2, rel=1e-4)
     assert frequency(1.0, 4e6, 1000.0) == pytest.approx(2 * reference, rel=1e-4)
     assert frequency(1.0, 1e6, 4000.0) == pytest.approx(reference / 2, rel=1e-4)
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
+def test_the_same_code_runs_on_cuda() -> None:
+    velocity = np.tile([0.3, 0.0, -3.0], (solid().nodes, 1))
+    on_cpu, on_cuda = (
+        body.run(body.vertices, velocity, frames=20, frame_time=0.01, substeps=40).positions
+        for body in (solid(viscosity=100.0, friction=0.5, device=device) for device in ("cpu", "cuda:0"))
+    )
+    assert np.abs(on_cpu - on_cuda).max() < 1e-9
 
 
 def test_beyond_the_stable_step_the_frame_is_named() -> None:
