@@ -245,7 +245,9 @@ def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
 
 
 def start(out: Path, split: str, *, workers: int = 2, **options: Any) -> subprocess.Popen[str]:
-    """The real command, in a process group of its own as a shell would start it."""
+    """The real command, in a process group of its own as a shell would start it, and not deaf to Ctrl-C (as it
+    would be if the tests themselves run in the background)."""
+    options.setdefault("preexec_fn", lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     command = [SCRIPT, "generate", "sheet_deformation", "--tier", "smoke", "--split", split, "--out", out]
     return subprocess.Popen(
         [*map(str, command), "--workers", str(workers), "--json"],
