@@ -60,12 +60,22 @@ def run(arguments: Sequence[str] | None = None) -> None:
 @cli.command("list")
 @JSON
 def list_command(as_json: bool) -> None:
-    """Tasks, tiers, models and presets, with the number of parameters of each."""
+    """Scenes, tasks, tiers, models and presets, with the number of parameters of each."""
     from m3gn_bench.datasets.schema import TIERS, tier_sizes
-    from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.generators.scene import get_scene, scene_names
     from m3gn_bench.model import PRESETS, build_model, load_preset, model_names
     from m3gn_bench.tasks import TASKS
 
+    scenes: list[dict[str, Any]] = [
+        {
+            "name": scene.name,
+            "version": scene.dataset_version,
+            "frames": scene.frames,
+            "sizes": scene.paper_sizes,
+            "fidelities": list(scene.fidelities),
+        }
+        for scene in map(get_scene, scene_names())
+    ]
     tasks: list[dict[str, Any]] = [
         {
             "name": task.name,
@@ -99,7 +109,27 @@ def list_command(as_json: bool) -> None:
     ]
     counts = {(m["name"], m["preset"], m["task"]): m["parameters"] for m in models}
     Report(as_json).finish(
-        {"tasks": tasks, "tiers": list(TIERS), "presets": list(PRESETS), "models": models},
+        {
+            "scenes": scenes,
+            "tasks": tasks,
+            "tiers": list(TIERS),
+            "presets": list(PRESETS),
+            "models": models,
+        },
+        table(
+            "Scenes",
+            ["scene", "version", "frames", "paper tier (train/val/test)", "fidelities"],
+            [
+                [
+                    s["name"],
+                    s["version"],
+                    s["frames"],
+                    "/".join(map(str, s["sizes"].values())),
+                    ", ".join(s["fidelities"]),
+                ]
+                for s in scenes
+            ],
+        ),
         table(
             "Tasks",
             ["task", "frames", "context sizes", *(f"{tier} (train/val/test)" for tier in TIERS)],

@@ -358,6 +358,13 @@ def parse(outcome: Outcome, code: int = 0) -> dict[str, Any]:
 
 def test_list_as_json(command: Command) -> None:
     record = parse(command("list", "--json"))
+    assert {scene["name"]: scene["sizes"]["train"] for scene in record["scenes"]} == {
+        "sheet_deformation": 630,
+        "deformable_block": 675,
+        "tissue_manipulation": 600,
+        "falling_teddy": 700,
+        "mixed_objects": 1800,
+    }
     assert record["tiers"] == ["smoke", "quick", "paper"]
     tasks = {task["name"]: task for task in record["tasks"]}
     assert set(tasks) == {"sheet_deformation", "sheet_deformation_ood"}
