@@ -10,13 +10,13 @@ import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import (
-    content_hash,
     damage_as_dataset_error,
     open_file,
     read_metadata,
     read_trajectory,
+    tier_hashes,
 )
-from m3gn_bench.datasets.schema import SPLITS, TIERS
+from m3gn_bench.datasets.schema import SPLITS
 
 CARDS = Path(__file__).parent / "cards"
 BEGIN = "<!-- numbers: written by `m3gn-bench card`, do not edit -->"
@@ -53,12 +53,7 @@ def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
                 task: "/".join(str(len(group[split])) for split in SPLITS if split in group)
                 for task, group in file["splits"].items()
             }
-        tiers = []
-        for tier in TIERS:
-            try:
-                tiers.append((tier, content_hash(file, tier)))
-            except DatasetError:
-                continue
+        hashes = tier_hashes(file)
         diagnostics: dict[str, list[float]] = {}
         steps = Moments()
         reach = 0.0
@@ -102,7 +97,7 @@ def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
         ("machine", metadata.machine),
         ("versions", ", ".join(f"{k} {v}" for k, v in metadata.simulator_versions.items())),
         ("generator, seed", f"m3gn-bench {metadata.generator_version}, {metadata.seed}"),
-        *((f"content hash, {tier}", f"`{digest}`") for tier, digest in tiers),
+        *((f"content hash, {tier}", f"`{digest}`") for tier, digest in hashes.items()),
     ]
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.schema import (
-    DATASET_SEED,
     FORMAT,
     SCHEMA_VERSION,
     SPLITS,
+    TIERS,
     Metadata,
     as_text,
     in_tier,
@@ -162,6 +162,17 @@ def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str]
     return combine_hashes(chosen)
 
 
+def tier_hashes(file: h5py.File) -> dict[str, str]:
+    """Content hashes of the tiers that the file holds whole."""
+    hashes: dict[str, str] = {}
+    for tier in TIERS:
+        try:
+            hashes[tier] = content_hash(file, tier)
+        except DatasetError:
+            continue
+    return hashes
+
+
 def find_dataset(
     folder: Path, scene: str, tier: str, splits: Sequence[str], version: str | None = None
 ) -> Path | None:
@@ -174,9 +185,11 @@ def find_dataset(
         try:
             with open_file(path) as file:
                 metadata = read_metadata(file)
-                usual: tuple[object, ...] = (scene, "default", {}, DATASET_SEED)
-                found = (metadata.scene, metadata.fidelity, metadata.variant, metadata.seed)
-                if found == usual and version in (None, metadata.dataset_version):
+                if (
+                    metadata.scene == scene
+                    and metadata.is_benchmark
+                    and version in (None, metadata.dataset_version)
+                ):
                     content_hash(file, tier, splits)
                     suitable.append((path.stat().st_size, path))
         except DatasetError:

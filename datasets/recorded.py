@@ -10,8 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, read_trajectory, stored_hashes
-from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, TIERS, Record, in_tier
+from m3gn_bench.datasets.file import (
+    content_hash,
+    open_file,
+    read_metadata,
+    read_trajectory,
+    stored_hashes,
+    tier_hashes,
+)
+from m3gn_bench.datasets.schema import SMALL_TIERS, Record, in_tier
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import write_bytes_atomically
 
@@ -33,6 +40,14 @@ class RecordedDataset(Record):
     machine: str
     hashes: dict[str, str]
     probes: dict[str, tuple[float, ...]]
+
+    def require(self, version: str, tier: str) -> None:
+        """Raises DatasetError if this tier of this version of the dataset is not recorded."""
+        if version != self.dataset_version or tier not in self.hashes:
+            raise DatasetError(
+                f"version {version}, tier {tier} of {self.scene} cannot be compared; recorded of {self.scene} are "
+                f"version {self.dataset_version}, tiers {', '.join(self.hashes)}"
+            )
 
 
 class Reproduction(Record):
@@ -69,12 +84,6 @@ def record(path: Path, folder: Path | None = None) -> Path:
     require_own(path)
     with open_file(path) as file:
         metadata = read_metadata(file)
-        hashes: dict[str, str] = {}
-        for tier in TIERS:
-            try:
-                hashes[tier] = content_hash(file, tier)
-            except DatasetError:
-                continue
         quick = sorted(key for key in stored_hashes(file) if in_tier(key, SMALL_TIERS["quick"]))
         recorded = RecordedDataset(
             scene=metadata.scene,
@@ -82,7 +91,7 @@ def record(path: Path, folder: Path | None = None) -> Path:
             generator_version=metadata.generator_version,
             simulator_versions=metadata.simulator_versions,
             machine=metadata.machine,
-            hashes=hashes,
+            hashes=tier_hashes(file),
             probes={key: probe(read_trajectory(file, key)) for key in quick},
         )
     destination = (folder or FOLDER) / f"{metadata.scene}.json"
@@ -99,7 +108,7 @@ def require_own(path: Path) -> None:
     """
     with open_file(path) as file:
         metadata = read_metadata(file)
-        if (metadata.fidelity, metadata.variant, metadata.seed) != ("default", {}, DATASET_SEED):
+        if not metadata.is_benchmark:
             raise DatasetError(
                 f"{path} is not the benchmark's own dataset: fidelity {metadata.fidelity}, seed {metadata.seed}, "
                 f"options {metadata.variant or 'none'}; only that one is recorded"
@@ -124,11 +133,7 @@ def compare(path: Path, folder: Path | None = None) -> Reproduction:
     with open_file(path) as file:
         metadata = read_metadata(file)
         recorded = read_record(metadata.scene, folder)
-        if recorded.dataset_version != metadata.dataset_version or metadata.tier not in recorded.hashes:
-            raise DatasetError(
-                f"{path} holds version {metadata.dataset_version}, tier {metadata.tier}; recorded of "
-                f"{metadata.scene} are version {recorded.dataset_version}, tiers {', '.join(recorded.hashes)}"
-            )
+        recorded.require(metadata.dataset_version, metadata.tier)
         identical = content_hash(file, metadata.tier) == recorded.hashes[metadata.tier]
         keys = [key for key in stored_hashes(file) if key in recorded.probes]
         largest = 0.0

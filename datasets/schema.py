@@ -95,6 +95,11 @@ class Metadata(Record):
         """Number of steps between frames: one less than frames."""
         return self.frames - 1
 
+    @property
+    def is_benchmark(self) -> bool:
+        """Whether everybody is meant to have this dataset: the scene's own options, fidelity and seed."""
+        return (self.fidelity, self.variant, self.seed) == ("default", {}, DATASET_SEED)
+
     def to_attributes(self) -> dict[str, Any]:
         """HDF5 attributes: numbers as they are, strings as bytes (of fixed length), everything else as JSON."""
         dumped = self.model_dump(mode="json")

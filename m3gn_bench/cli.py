@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from m3gn_bench.console import Report, table
-from m3gn_bench.datasets.errors import BenchError, DatasetError
+from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.version import __version__
 
 # Modules that need torch or a simulator are imported inside the commands, so that --help stays instant.
@@ -266,8 +266,7 @@ def validate(file: Path, strict: bool, as_json: bool) -> None:
 @JSON
 def info(file: Path, as_json: bool) -> None:
     """What a dataset FILE holds and where it comes from."""
-    from m3gn_bench.datasets.file import content_hash, damage_as_dataset_error, open_file, read_metadata
-    from m3gn_bench.datasets.schema import TIERS
+    from m3gn_bench.datasets.file import damage_as_dataset_error, open_file, read_metadata, tier_hashes
 
     with open_file(file) as opened:
         metadata = read_metadata(opened)
@@ -276,12 +275,7 @@ def info(file: Path, as_json: bool) -> None:
                 task: {split: len(keys) for split, keys in group.items()}
                 for task, group in opened["splits"].items()
             }
-        hashes: dict[str, str] = {}
-        for tier in TIERS:
-            try:
-                hashes[tier] = content_hash(opened, tier)
-            except BenchError:
-                continue  # the file does not hold this tier
+        hashes = tier_hashes(opened)
     record: dict[str, object] = {
         "file": str(file),
         "megabytes": file.stat().st_size / 1e6,
@@ -364,9 +358,9 @@ def card(file: Path, as_json: bool) -> None:
     require_own(file)
     with open_file(file) as opened:
         scene = get_scene(read_metadata(opened).scene)
-    effect = ("softest against stiffest material, mean squared difference, scaled", material_effect(scene))
+    effect = f"{material_effect(scene):.3g}"
     path = CARDS / f"{scene.name}.md"
-    block = numbers(file, [(effect[0], f"{effect[1]:.3g}")])
+    block = numbers(file, [("softest against stiffest material, mean squared difference, scaled", effect)])
     write_bytes_atomically(path, fill(path.read_text(), block).encode())
     recorded = record(file)
     Report(as_json).finish(
@@ -390,12 +384,7 @@ def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) ->
 
     names = scene_names()
     scene = get_scene(scene_name or names[date.today().toordinal() % len(names)])
-    recorded = read_record(scene.name)  # complain before the work, not after it
-    if tier not in recorded.hashes or recorded.dataset_version != scene.dataset_version:
-        raise DatasetError(
-            f"recorded of {scene.name} are version {recorded.dataset_version}, tiers {', '.join(recorded.hashes)}; "
-            f"this generator makes version {scene.dataset_version}, and tier {tier} was asked for"
-        )
+    read_record(scene.name).require(scene.dataset_version, tier)  # before the work, not after it
     report = Report(as_json)
     with TemporaryDirectory() as folder, report.progress(f"simulating {scene.name}") as on_progress:
         made = generate_dataset(scene, tier, Path(folder), workers=workers, on_progress=on_progress)
