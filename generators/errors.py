@@ -1,5 +1,7 @@
 """Errors of the generators."""
 
+import importlib.util
+
 from m3gn_bench.datasets.errors import BenchError
 
 
@@ -9,3 +11,11 @@ class GeneratorError(BenchError):
 
 class SolverError(BenchError):
     """A solver did not reach equilibrium. The draw is rejected and counted, never kept."""
+
+
+def require_installed(library: str, purpose: str, extra: str) -> None:
+    """Raises GeneratorError, naming the extra to install, where an optional library is missing."""
+    if importlib.util.find_spec(library) is None:
+        raise GeneratorError(
+            f"{purpose} needs {library}, which is not installed: pip install 'm3gn-bench[{extra}]'"
+        )

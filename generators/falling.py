@@ -9,8 +9,7 @@ objects are not published, so these are ours.
 
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from importlib.util import find_spec
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,10 +17,13 @@ from scipy.spatial.transform import Rotation
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.errors import GeneratorError, SolverError
+from m3gn_bench.generators.errors import GeneratorError, SolverError, require_installed
 from m3gn_bench.generators.objects import SoftBody, load_object
 from m3gn_bench.generators.scene import SingleTask
 from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
+
+if TYPE_CHECKING:  # it loads Warp
+    from m3gn_bench.generators.solvers.captured import CapturedSolid
 
 SIZE = 0.5  # [m], an object's largest extent in its own axes
 DENSITY = 1000.0  # [kg/m^3]
@@ -98,10 +100,8 @@ class _FallingObjects(SingleTask):
     def __post_init__(self) -> None:
         if self.solver not in get_args(Solver):
             raise GeneratorError(unknown_name("solver", self.solver, list(get_args(Solver))))
-        if self.solver == "newton-vbd" and find_spec("newton") is None:
-            raise GeneratorError(
-                "the solver newton-vbd needs Newton, which is not installed: pip install 'm3gn-bench[newton]'"
-            )
+        if self.solver == "newton-vbd":
+            require_installed("newton", "the solver newton-vbd", "newton")
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -244,7 +244,7 @@ class _FallingObjects(SingleTask):
 
     def _solid(
         self, start: np.ndarray, tetrahedra: np.ndarray, parameters: FallParameters, level: FallFidelity
-    ) -> tuple[TetrahedralSolid, int]:
+    ) -> "tuple[CapturedSolid, int]":
         """The body, ready to be moved by the chosen solver, and that solver's substeps per frame."""
         scene: dict[str, Any] = {
             "density": DENSITY,

@@ -18,7 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.solvers.captured import CapturedSolid
 from m3gn_bench.generators.solvers.explicit_kernels import (
     cell_volumes,
     corner_forces,
@@ -26,13 +26,12 @@ from m3gn_bench.generators.solvers.explicit_kernels import (
     nodal_pressures,
 )
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions, TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Array, SolidOptions
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
-CAPTURED = 50  # substeps per recorded graph: long enough to hide the launch, short enough to record fast
 
 
-class ExplicitSolid(TetrahedralSolid):
+class ExplicitSolid(CapturedSolid):
     """A soft solid over a rigid floor, moved by leapfrog.
 
     Args:
@@ -45,6 +44,8 @@ class ExplicitSolid(TetrahedralSolid):
     Raises:
         ValueError: a parameter out of its physical range, or a tetrahedron without volume.
     """
+
+    captured = 50
 
     def __init__(
         self,
@@ -94,42 +95,19 @@ class ExplicitSolid(TetrahedralSolid):
 
     # -- motion ----------------------------------------------------------------------------------------
 
-    def run(
-        self,
-        positions: Array,
-        velocities: Array,
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: int,
-        first_frame: int = 0,
-    ) -> Motion:
-        substep = frame_time / substeps
-        parts = next(k for k in range(max(1, substeps // CAPTURED), 0, -1) if substeps % k == 0)
-        path = np.empty((frames + 1, self.nodes, 3))
-        speeds = np.empty_like(path)
-        path[0] = positions
-        # Leapfrog's velocities live between positions: go back half a step.
-        speeds[0] = velocities - self.accelerations(positions, velocities) * (substep / 2)
-        self._x.assign(path[0])
-        self._v.assign(speeds[0])
-        with wp.ScopedCapture(device=self.device) as capture:
-            for _ in range(substeps // parts):
-                self._step(substep)
-        for frame in range(1, frames + 1):
-            for _ in range(parts):
-                wp.capture_launch(capture.graph)
-            path[frame], speeds[frame] = self._x.numpy(), self._v.numpy()
-            if not np.isfinite(path[frame]).all():
-                raise SolverError(
-                    f"frame {first_frame + frame}: positions are not finite; {substeps} substeps per frame are too few"
-                )
-        return Motion(path, speeds, lag=substep / 2)
+    def _earlier(self, positions: Array, velocities: Array, lag: float) -> Array:
+        return velocities - self.accelerations(positions, velocities) * lag
+
+    def _assign(self, positions: Array, velocities: Array) -> None:
+        self._x.assign(np.ascontiguousarray(positions, dtype=np.float64))
+        self._v.assign(np.ascontiguousarray(velocities, dtype=np.float64))
+
+    def _state(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._x.numpy(), self._v.numpy()
 
     def accelerations(self, positions: Array, velocities: Array) -> Array:
         """By elasticity, viscosity and gravity [m/s^2], shape [nodes, 3]; the floor not counted."""
-        self._x.assign(np.ascontiguousarray(positions, dtype=np.float64))
-        self._v.assign(np.ascontiguousarray(velocities, dtype=np.float64))
+        self._assign(positions, velocities)
         self._launch_forces()
         by_corner = self._forces.numpy()
         forces = np.stack([self.gather(by_corner[:, axis]) for axis in range(3)], axis=1)
@@ -145,11 +123,12 @@ class ExplicitSolid(TetrahedralSolid):
         law = [self.mu, self.lam, self.viscosity, self.nodal_pressure]
         self._launch(corner_forces, self.cells, self._x, self._v, *body, self._pressures, *law, self._forces)
 
-    def _step(self, substep: float) -> None:
-        self._launch_forces()
+    def _advance(self, substeps: int, substep: float) -> None:
         gather = [self._forces, self._start, self._incident, self._inverse_mass]
         world = [self.gravity, self.friction, self.floor, substep]
-        self._launch(move, self.nodes, *gather, *world, self._x, self._v)
+        for _ in range(substeps):
+            self._launch_forces()
+            self._launch(move, self.nodes, *gather, *world, self._x, self._v)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object) -> None:
         wp.launch(kernel, dim=size, inputs=list(inputs), device=self.device)

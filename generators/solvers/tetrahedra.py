@@ -122,31 +122,6 @@ class TetrahedralSolid:
         self.gradients[:, 1:] = self.inverse_edges
         self.gradients[:, 0] = -self.inverse_edges.sum(1)
 
-    def run(
-        self,
-        positions: Array,
-        velocities: Array,
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: int,
-        first_frame: int = 0,
-    ) -> Motion:
-        """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
-
-        Args:
-            positions: [m], shape [nodes, 3].
-            velocities: [m/s], shape [nodes, 3].
-            frames: number of frames to compute.
-            frame_time: time between frames [s].
-            substeps: of the solver, per frame.
-            first_frame: what to call the state given, in errors.
-
-        Raises:
-            SolverError: names the first frame whose positions are not finite.
-        """
-        raise NotImplementedError
-
     def gather(self, corner_values: Array) -> Array:
         """Sum values of the cells' corners [cells * 4] at the nodes [nodes]."""
         return np.asarray(np.bincount(self.tetrahedra.ravel(), corner_values, self.nodes))

@@ -36,7 +36,6 @@ draws (nu up to 0.46) 2 x 40, 2 x 80 and 2 x 160 are off by 1.9, 0.9 and 0.45 % 
 gain energy in the impact (more than 1 % of it within a frame), the third does not.
 """
 
-import importlib.util
 import logging
 from types import ModuleType
 from typing import Unpack
@@ -44,19 +43,19 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from m3gn_bench.generators.errors import GeneratorError, SolverError
+from m3gn_bench.generators.errors import require_installed
+from m3gn_bench.generators.solvers.captured import CapturedSolid
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions, TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Array, SolidOptions
 from m3gn_bench.generators.solvers.vbd_kernels import set_velocities
 
 FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 500 N sinks 0.05 mm into the skin
 FLOOR_SKIN = 2e-4  # [m], the height at which the springs begin
 FRICTION_SPEED = 1e-2  # [m/s], slower sliding is resisted less than Coulomb's law says
 ANYWHERE = 1e6  # [m], so far from the floor a node's contact is known beforehand
-CAPTURED = 10  # substeps per recorded graph, at most
 
 
-class VertexBlockDescent(TetrahedralSolid):
+class VertexBlockDescent(CapturedSolid):
     """A soft solid on plain linear tetrahedra over a floor, moved by Newton's `SolverVBD`.
 
     Args:
@@ -70,6 +69,8 @@ class VertexBlockDescent(TetrahedralSolid):
         GeneratorError: Newton is not installed.
         ValueError: a parameter out of its physical range, or a tetrahedron without volume.
     """
+
+    captured = 10
 
     def __init__(
         self,
@@ -129,53 +130,21 @@ class VertexBlockDescent(TetrahedralSolid):
             self._contacts = pipeline.contacts()
             pipeline.collide(self._states[0], self._contacts)
 
-    def run(
-        self,
-        positions: Array,
-        velocities: Array,
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: int,
-        first_frame: int = 0,
-    ) -> Motion:
-        """Move on from a state for `frames` frames of `frame_time` [s]; the first returned is the state given.
-
-        Velocities are mean ones over a substep, so they lag half of one behind.
-
-        Args:
-            positions: [m], shape [nodes, 3].
-            velocities: [m/s], shape [nodes, 3].
-            frames: number of frames to compute.
-            frame_time: time between frames [s].
-            substeps: steps of implicit Euler per frame.
-
-        Raises:
-            SolverError: names the first frame whose positions are not finite.
-        """
-        substep = frame_time / substeps
-        path = np.empty((frames + 1, self.nodes, 3))
-        speeds = np.empty_like(path)
-        path[0] = positions
+    def _earlier(self, positions: Array, velocities: Array, lag: float) -> Array:
         # With half a step of gravity taken back, free fall is exact.
-        speeds[0] = np.where(self._free[:, None], velocities, 0.0)
-        speeds[0, self._free, 2] += self.gravity * substep / 2
-        self._states[0].particle_q.assign(path[0].astype(np.float32))
-        self._states[0].particle_qd.assign(speeds[0].astype(np.float32))
-        parts = next(k for k in range(-(-substeps // CAPTURED), substeps + 1) if substeps % k == 0)
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._advance(substeps // parts, substep)
-        for frame in range(1, frames + 1):
-            for _ in range(parts):
-                wp.capture_launch(capture.graph)
-            path[frame] = self._states[0].particle_q.numpy()
-            speeds[frame] = self._states[0].particle_qd.numpy()
-            if not np.isfinite(path[frame]).all():
-                raise SolverError(
-                    f"frame {first_frame + frame}: positions are not finite; "
-                    f"{self.iterations} iterations in {substeps} substeps per frame are too few"
-                )
-        return Motion(path, speeds, lag=substep / 2)
+        earlier = np.where(self._free[:, None], velocities, 0.0)
+        earlier[self._free, 2] += self.gravity * lag
+        return earlier
+
+    def _assign(self, positions: Array, velocities: Array) -> None:
+        self._states[0].particle_q.assign(positions.astype(np.float32))
+        self._states[0].particle_qd.assign(velocities.astype(np.float32))
+
+    def _state(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._states[0].particle_q.numpy(), self._states[0].particle_qd.numpy()
+
+    def _effort(self, substeps: int) -> str:
+        return f"{self.iterations} iterations in {substeps} substeps"
 
     def _advance(self, substeps: int, substep: float) -> None:
         now, then = self._states
@@ -191,10 +160,7 @@ class VertexBlockDescent(TetrahedralSolid):
 
 
 def _newton() -> ModuleType:
-    if importlib.util.find_spec("newton") is None:
-        raise GeneratorError(
-            "the solver newton-vbd needs Newton, which is not installed: pip install 'm3gn-bench[newton]'"
-        )
+    require_installed("newton", "the solver newton-vbd", "newton")
     import newton
 
     logging.getLogger("newton").setLevel(logging.ERROR)
