@@ -1,7 +1,8 @@
 """From stored trajectories to what models see: scaled tensors, and no more of the future than is allowed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -19,18 +20,19 @@ from m3gn_bench.tasks import Task
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What is known of one or several deformable bodies and does not change with time.
+    """What is known of one or several deformable bodies and their colliders and does not change with time.
 
     Several bodies form a disjoint union: their nodes are concatenated and their edges shifted, so every
-    model handles a batch of trajectories without knowing it.
+    model handles a batch of trajectories without knowing it. Where there is no collider, it has no nodes.
 
     Attributes:
         rest_positions: scaled, shape [nodes, dim].
         edges: sender and receiver of each directed mesh edge, sorted by receiver, shape [2, edges].
         static_features: shape [nodes, static].
         fixed: nodes that never move, shape [nodes], bool.
-        material: scaled material parameters, shape [nodes, materials].
-        node_counts: number of nodes of each body.
+        material: scaled material parameters, one row per body, shape [bodies, materials].
+        collider_edges: sender and receiver among collider nodes, shape [2, collider_edges].
+        node_counts, collider_counts: number of mesh and of collider nodes of each body.
     """
 
     rest_positions: Tensor
@@ -38,17 +40,44 @@ class Body:
     static_features: Tensor
     fixed: Tensor
     material: Tensor
+    collider_edges: Tensor
     node_counts: tuple[int, ...]
+    collider_counts: tuple[int, ...]
 
     @property
     def nodes(self) -> int:
-        """Number of nodes of all bodies."""
+        """Number of mesh nodes of all bodies."""
         return sum(self.node_counts)
 
+    @property
+    def collider_nodes(self) -> int:
+        """Number of collider nodes of all bodies."""
+        return sum(self.collider_counts)
+
+    @cached_property
     def body_of_node(self) -> Tensor:
-        """Index of the body that each node belongs to, shape [nodes]."""
-        counts = torch.tensor(self.node_counts, device=self.fixed.device)
-        return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+        """Index of the body that each mesh node belongs to, shape [nodes]."""
+        return self._spread(self.node_counts)
+
+    @cached_property
+    def body_of_collider_node(self) -> Tensor:
+        """Index of the body that each collider node belongs to, shape [collider_nodes]."""
+        return self._spread(self.collider_counts)
+
+    @cached_property
+    def rest_vectors(self) -> Tensor:
+        """Vector at rest from receiver to sender of each mesh edge, and its length, shape [edges, dim + 1]."""
+        senders, receivers = self.edges
+        return with_length(self.rest_positions[senders] - self.rest_positions[receivers])
+
+    def _spread(self, counts: tuple[int, ...]) -> Tensor:
+        numbers = torch.tensor(counts, device=self.fixed.device)
+        return torch.repeat_interleave(torch.arange(len(counts), device=numbers.device), numbers)
+
+
+def with_length(vectors: Tensor) -> Tensor:
+    """Vectors and their lengths, shape [..., dim + 1]."""
+    return torch.cat([vectors, vectors.norm(dim=-1, keepdim=True)], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,18 +88,23 @@ class Context:
         body: the bodies.
         positions: frames 1..T^c, scaled, shape [context_frames, nodes, dim]; the last is the anchor.
         horizon: number of frames to predict.
-        collider_path: the collider's positions in all frames, shape [frames, collider_nodes, dim], or None.
+        collider_path: the collider's positions in all frames, shape [frames, collider_nodes, dim].
     """
 
     body: Body
     positions: Tensor
     horizon: int
-    collider_path: Tensor | None = None
+    collider_path: Tensor
+
+    @property
+    def size(self) -> int:
+        """Number of context frames T^c."""
+        return len(self.positions)
 
     @property
     def frames(self) -> int:
         """Length of the whole trajectory in frames."""
-        return len(self.positions) + self.horizon
+        return self.size + self.horizon
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +114,13 @@ class Case:
     Attributes:
         body: the bodies.
         positions: shape [frames, nodes, dim].
-        collider_path: shape [frames, collider_nodes, dim], or None.
+        collider_path: shape [frames, collider_nodes, dim].
         keys: the trajectories' names in the dataset.
     """
 
     body: Body
     positions: Tensor
-    collider_path: Tensor | None
+    collider_path: Tensor
     keys: tuple[str, ...]
 
     @property
@@ -109,16 +143,10 @@ class Case:
 
     def to(self, device: torch.device) -> "Case":
         """The same case on another device."""
-        body = Body(
-            rest_positions=self.body.rest_positions.to(device),
-            edges=self.body.edges.to(device),
-            static_features=self.body.static_features.to(device),
-            fixed=self.body.fixed.to(device),
-            material=self.body.material.to(device),
-            node_counts=self.body.node_counts,
-        )
-        path = None if self.collider_path is None else self.collider_path.to(device)
-        return Case(body, self.positions.to(device), path, self.keys)
+        values = {field.name: getattr(self.body, field.name) for field in fields(Body)}
+        moved = {name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)}
+        body = replace(self.body, **moved)
+        return Case(body, self.positions.to(device), self.collider_path.to(device), self.keys)
 
 
 def join(cases: Sequence[Case]) -> Case:
@@ -126,30 +154,41 @@ def join(cases: Sequence[Case]) -> Case:
     if len(cases) == 1:
         return cases[0]
     bodies = [case.body for case in cases]
-    offsets = np.cumsum([0] + [body.nodes for body in bodies[:-1]])
+
+    def shifted(edges: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
+        starts = np.cumsum([0, *counts[:-1]])
+        return torch.cat([e + int(start) for e, start in zip(edges, starts, strict=True)], dim=1)
+
     body = Body(
         rest_positions=torch.cat([b.rest_positions for b in bodies]),
-        edges=torch.cat([b.edges + int(o) for b, o in zip(bodies, offsets, strict=True)], dim=1),
+        edges=shifted([b.edges for b in bodies], [b.nodes for b in bodies]),
         static_features=torch.cat([b.static_features for b in bodies]),
         fixed=torch.cat([b.fixed for b in bodies]),
         material=torch.cat([b.material for b in bodies]),
+        collider_edges=shifted([b.collider_edges for b in bodies], [b.collider_nodes for b in bodies]),
         node_counts=tuple(n for b in bodies for n in b.node_counts),
+        collider_counts=tuple(n for b in bodies for n in b.collider_counts),
     )
-    paths = [case.collider_path for case in cases if case.collider_path is not None]
     return Case(
         body=body,
         positions=torch.cat([case.positions for case in cases], dim=1),
-        collider_path=torch.cat(paths, dim=1) if paths else None,
+        collider_path=torch.cat([case.collider_path for case in cases], dim=1),
         keys=tuple(key for case in cases for key in case.keys),
     )
+
+
+def both_directions(pairs: np.ndarray) -> np.ndarray:
+    """Directed edges, each once, from pairs of nodes [n, 2], sorted by receiver; shape [2, edges]."""
+    unique = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)  # rows (receiver, sender)
+    return np.ascontiguousarray(unique[:, ::-1].T).astype(np.int64)
 
 
 def mesh_edges(cells: np.ndarray) -> np.ndarray:
     """Both directions of every edge of a simplex mesh, sorted by receiver, shape [2, edges]."""
     corners = cells.shape[1]
-    pairs = np.concatenate([cells[:, [i, j]] for i in range(corners) for j in range(corners) if i != j])
-    unique = np.unique(pairs[:, ::-1], axis=0)  # rows sorted by receiver, then sender
-    return np.ascontiguousarray(unique[:, ::-1].T).astype(np.int64)
+    return both_directions(
+        np.concatenate([cells[:, [i, j]] for i in range(corners) for j in range(i + 1, corners)])
+    )
 
 
 class Scaling(Protocol):
@@ -179,18 +218,28 @@ def case_from(task: Task, scaling: Scaling, trajectory: Trajectory, key: str) ->
     def scaled(positions: np.ndarray) -> Tensor:
         return torch.from_numpy(((positions - centre) / scaling.scale_length).astype(np.float32))
 
-    nodes = len(trajectory.mesh.rest_positions)
+    path = trajectory.collider_positions
+    if (path is not None) != task.has_collider:
+        raise DatasetError(
+            f"trajectory {key} has {'no' if path is None else 'a'} collider, but task {task.name} "
+            f"has {'one' if task.has_collider else 'none'}"
+        )
+    collider_path = scaled(np.empty((frames, 0, dimension)) if path is None else path)
+    collider_edges = trajectory.collider_edges
     material = [feature(trajectory.material[feature.name]) for feature in task.material]
     body = Body(
         rest_positions=scaled(trajectory.mesh.rest_positions),
         edges=torch.from_numpy(mesh_edges(trajectory.mesh.cells)),
         static_features=torch.from_numpy(task.static(trajectory)),
         fixed=torch.from_numpy(trajectory.mesh.node_type == FIXED),
-        material=torch.tensor(material, dtype=torch.float32).expand(nodes, -1).contiguous(),
-        node_counts=(nodes,),
+        material=torch.tensor([material], dtype=torch.float32),
+        collider_edges=torch.from_numpy(
+            both_directions(np.empty((0, 2), np.int32) if collider_edges is None else collider_edges)
+        ),
+        node_counts=(len(trajectory.mesh.rest_positions),),
+        collider_counts=(collider_path.shape[1],),
     )
-    path = trajectory.collider_positions
-    return Case(body, scaled(trajectory.positions), None if path is None else scaled(path), (key,))
+    return Case(body, scaled(trajectory.positions), collider_path, (key,))
 
 
 def load_cases(path: Path, task: Task, split: Split, tier: str | None = None) -> list[Case]:

@@ -1,16 +1,27 @@
-"""Graphs for message passing: features of nodes and edges at a given moment.
+"""Graphs for message passing: features of nodes and edges at given moments.
 
-Edge features, for every method alike (paper, appendix B; order as in reference implementations): the edge
-type's one-hot code, the vector between the two nodes at rest and its length, the same at the moment. All
-vectors are sender minus receiver, so features do not change when the whole scene is translated.
+Features, for every method alike (paper, appendix B; lengths from its parameter counts):
+
+- A node has its type's one-hot code (mesh or collider), the task's static features (zero on the collider), the
+  height where the task has no other way to know the ground, and whatever a model adds.
+- An edge has its type's one-hot code; the vector between its nodes at rest and the length, zero unless it is a
+  mesh edge; and the same at the moment. Vectors are sender minus receiver, so nothing changes when the whole
+  scene is translated.
+
+Mesh and collider are connected, both ways, where nodes are closer than `CONTACT_RADIUS` at the moment.
 """
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from m3gn_bench.data import Body
+from m3gn_bench.data import Body, with_length
+from m3gn_bench.tasks import Task
+
+CONTACT_RADIUS = 0.3  # scaled units (paper, table of hyper-parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,40 +42,94 @@ class Graph:
     inverse_degree: Tensor
 
 
-def with_length(vectors: Tensor) -> Tensor:
-    """Vectors and their lengths, shape [..., dim + 1]."""
-    return torch.cat([vectors, vectors.norm(dim=-1, keepdim=True)], dim=-1)
-
-
-def build_graph(body: Body, positions: Tensor, node_features: Tensor) -> Graph:
-    """The union of one mesh graph per moment.
+def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, features: Tensor) -> Graph:
+    """The union of one graph per moment.
 
     Args:
+        task: says which features all models share.
         body: the bodies.
-        positions: at each moment, shape [moments, nodes, dim].
-        node_features: shape [moments, nodes, features].
+        positions: of mesh nodes at each moment, shape [moments, nodes, dim].
+        collider: of collider nodes, shape [moments, collider_nodes, dim].
+        features: what the model adds to each node, mesh nodes first, shape [moments, nodes + collider_nodes,
+            features].
 
     Returns:
-        A graph of moments * nodes nodes, ordered by moment.
+        A graph whose nodes are ordered by moment; in a moment, mesh nodes come first.
     """
-    moments = len(positions)
-    senders, receivers = body.edges
-    rest = with_length(body.rest_positions[senders] - body.rest_positions[receivers])
-    world = with_length(positions[:, senders] - positions[:, receivers])
-    kind = rest.new_ones(1, 1).expand(len(senders), -1)  # a single type of edge: the mesh's
-    static = torch.cat([kind, rest], dim=-1).expand(moments, -1, -1)
-    shift = (torch.arange(moments, device=senders.device) * body.nodes)[:, None]
-    degree = torch.bincount(receivers, minlength=body.nodes).clamp(min=1)
+    moments, nodes = len(positions), body.nodes + body.collider_nodes
+    shift = (torch.arange(moments, device=positions.device) * nodes)[:, None]
+    edges = [(body.edges[:, None] + shift).flatten(1)]
+    if task.collider_has_edges:
+        edges.append((body.collider_edges[:, None] + body.nodes + shift).flatten(1))
+    if task.has_collider:
+        contacts = contact_pairs(body, positions, collider)
+        edges += [contacts.flip(0), contacts]
+    senders, receivers = torch.cat(edges, dim=1)
+    place = torch.cat([positions, collider], dim=1).flatten(0, 1)
+    world = with_length(place[senders] - place[receivers])
+    static = world.new_zeros(len(senders), task.edge_types + task.dimension + 1)
+    for kind, part in enumerate(static.split([pairs.shape[1] for pairs in edges])):
+        part[:, kind] = 1
+    static[: moments * body.edges.shape[1], task.edge_types :] = body.rest_vectors.repeat(moments, 1)
+    shared = shared_node_features(task, body, positions)
     return Graph(
-        node_features=node_features.flatten(0, 1),
-        edge_features=torch.cat([static, world], dim=-1).flatten(0, 1),
-        senders=(senders + shift).flatten(),
-        receivers=(receivers + shift).flatten(),
-        inverse_degree=(1 / degree).repeat(moments)[:, None],
+        node_features=torch.cat([shared, features], dim=-1).flatten(0, 1),
+        edge_features=torch.cat([static, world], dim=-1),
+        senders=senders,
+        receivers=receivers,
+        inverse_degree=1 / torch.bincount(receivers, minlength=moments * nodes).clamp(min=1)[:, None],
     )
 
 
-def static_node_features(body: Body) -> Tensor:
-    """Node type (one-hot; here a single type) and the task's static features, shape [nodes, features]."""
-    kind = body.static_features.new_ones(body.nodes, 1)
-    return torch.cat([kind, body.static_features], dim=-1)
+def shared_node_features(task: Task, body: Body, positions: Tensor) -> Tensor:
+    """What every model knows of a node, shape [moments, nodes + collider_nodes, task.node_features]."""
+    moments = len(positions)
+    features = positions.new_zeros(moments, body.nodes + body.collider_nodes, task.node_features)
+    mesh, collider = features[:, : body.nodes], features[:, body.nodes :]
+    mesh[..., 0] = 1
+    if task.has_collider:
+        collider[..., 1] = 1
+    last = task.node_types + len(task.static_features)
+    mesh[..., task.node_types : last] = body.static_features
+    if task.height_feature:
+        mesh[..., last] = positions[..., -1]
+    return features
+
+
+def on_mesh(body: Body, values: Tensor) -> Tensor:
+    """Values of mesh nodes [moments, nodes, n] with zeros on collider nodes appended."""
+    return torch.cat([values, values.new_zeros(len(values), body.collider_nodes, values.shape[-1])], dim=1)
+
+
+def on_collider(body: Body, values: Tensor) -> Tensor:
+    """Values of collider nodes [moments, collider_nodes, n] after zeros on mesh nodes."""
+    return torch.cat([values.new_zeros(len(values), body.nodes, values.shape[-1]), values], dim=1)
+
+
+def contact_pairs(body: Body, positions: Tensor, collider: Tensor) -> Tensor:
+    """Mesh nodes and collider nodes of the same body closer than the contact radius at the same moment.
+
+    Args:
+        body: the bodies.
+        positions, collider: shape [moments, nodes, dim] and [moments, collider_nodes, dim].
+
+    Returns:
+        Indices into the nodes of all moments (in each, mesh nodes come first), shape [2, pairs].
+    """
+    moments, nodes = len(positions), body.nodes + body.collider_nodes
+    bodies = len(body.node_counts)
+
+    def tree(points: Tensor, body_of_point: Tensor) -> cKDTree:
+        # One more coordinate keeps bodies and moments apart, so a single tree serves all of them.
+        group = np.arange(moments)[:, None] * bodies + body_of_point.cpu().numpy()
+        flat = points.detach().cpu().numpy().astype(np.float64)
+        return cKDTree(np.concatenate([flat, 2 * CONTACT_RADIUS * group[..., None]], -1).reshape(-1, flat.shape[-1] + 1))
+
+    found = tree(positions, body.body_of_node).sparse_distance_matrix(
+        tree(collider, body.body_of_collider_node), CONTACT_RADIUS, output_type="ndarray"
+    )
+    found = found[found["v"] < CONTACT_RADIUS]
+    mesh_moment, mesh_node = np.divmod(found["i"], body.nodes)
+    collider_moment, collider_node = np.divmod(found["j"], body.collider_nodes)
+    pairs = np.stack([mesh_moment * nodes + mesh_node, collider_moment * nodes + body.nodes + collider_node])
+    return torch.from_numpy(pairs).to(positions.device)

@@ -7,108 +7,176 @@ movement primitive, whose time scale tau is shared by all nodes of a trajectory.
 """
 
 import math
+import zlib
+from typing import ClassVar
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
-from m3gn_bench.data import Case, Context
-from m3gn_bench.graph import build_graph, static_node_features
+from m3gn_bench.data import Body, Context
+from m3gn_bench.graph import build_graph, on_collider, on_mesh
 from m3gn_bench.message_passing import MessagePassingNetwork
-from m3gn_bench.model import Model, ModelConfig, hold_fixed
+from m3gn_bench.model import ModelConfig, TrajectoryModel, hold_fixed
 from m3gn_bench.movement_primitives import TAU_RANGE, ProDMP
 from m3gn_bench.tasks import Task
 
 
-class M3GNConfig(ModelConfig):
-    """Hyper-parameters of M3GN (defaults: the paper's)."""
+class ContextConfig(ModelConfig):
+    """Hyper-parameters of the context network (defaults: the paper's)."""
 
     width: int = Field(default=128, ge=1)
     message_passing_steps: int = Field(default=15, ge=1)
     latent_size: int = Field(default=64, ge=1)  # of the task description z
+    # Context pairs encoded per training step: the last one and some others at random; all of them when
+    # predicting. The maximum over time does not mind missing pairs, and encoding all would take most of a
+    # step's time.
+    training_context_pairs: int | None = Field(default=None, ge=1)
+    # Standard deviation of noise on the frames that the context network reads, scaled units, in training and
+    # prediction (paper, appendix: robustness to noisy observations). The anchor itself stays exact.
+    context_noise: float = Field(default=0.0, ge=0)
+
+
+class PrimitivesConfig(ModelConfig):
+    """Hyper-parameters of the trajectory simulator (defaults: the paper's)."""
+
+    width: int = Field(default=128, ge=1)
+    message_passing_steps: int = Field(default=15, ge=1)
     basis_functions: int = Field(default=30, ge=2)
     alpha: float = Field(default=25.0, gt=0)
     alpha_x: float = Field(default=2.0, gt=0)
     # Where tau starts before training. It hardly moves from there; least-squares fits of Sheet Deformation
     # need weights ten times smaller, and are a hundred times closer, at 0.7 than at 1.65.
     initial_tau: float = Field(default=1.65, gt=TAU_RANGE[0], lt=TAU_RANGE[1])
-    # Context pairs encoded per training step: the last one and some others at random; all of them when
-    # predicting. The maximum over time does not mind missing pairs, and encoding all would take most of a
-    # step's time.
-    training_context_pairs: int | None = Field(default=None, ge=1)
+    # The last movement as a node feature; None: as the published parameter counts have it for the task.
+    history: bool | None = None
 
 
-class M3GN(Model):
-    """The model; `predict` needs one call for the whole horizon."""
+class M3GNConfig(ContextConfig, PrimitivesConfig):
+    """Hyper-parameters of M3GN (defaults: the paper's)."""
 
-    Config = M3GNConfig
-    preset_file = "m3gn.toml"
-    config: M3GNConfig
 
-    def __init__(self, task: Task, config: M3GNConfig) -> None:
-        super().__init__(task, config)
-        size = {"width": config.width, "steps": config.message_passing_steps}
-        dimension, features = task.dimension, task.node_features
-        self.context_network = MessagePassingNetwork(
-            features + dimension, task.edge_features, config.latent_size, **size
-        )
-        self.simulator = MessagePassingNetwork(
-            features + config.latent_size + task.m3gn_history * dimension,
+class ContextEncoder(nn.Module):
+    """Gives each node a task description z from the frames before the anchor (paper, equation 4)."""
+
+    outputs_per_latent: ClassVar[int] = 1
+
+    def __init__(self, task: Task, config: ContextConfig) -> None:
+        super().__init__()
+        self.task = task
+        self.config = config
+        self.network = MessagePassingNetwork(
+            task.node_features + task.collider_features + task.dimension,
             task.edge_features,
-            dimension * (config.basis_functions + 1) + 1,
-            **size,
+            self.outputs_per_latent * config.latent_size,
+            width=config.width,
+            steps=config.message_passing_steps,
+        )
+
+    def forward(self, context: Context, velocity_scale: Tensor, rng: np.random.Generator | None) -> Tensor:
+        """The task description, shape [nodes + collider_nodes, latent_size].
+
+        Args:
+            context: the frames.
+            velocity_scale: unit of the movements.
+            rng: chooses context pairs in training; None when predicting, which reads all pairs.
+        """
+        pairs = self.choose_pairs(context.size, rng).to(context.positions.device)
+        return self.aggregate(self.encode(context, pairs, velocity_scale), pairs, context.body, rng)
+
+    def choose_pairs(self, size: int, rng: np.random.Generator | None) -> Tensor:
+        """The frames t whose pair (t, t + 1) is read, counted from 0."""
+        last = size - 2
+        if rng is None or self.config.training_context_pairs is None:
+            return torch.arange(last + 1)
+        others = rng.permutation(last)[: self.config.training_context_pairs - 1]
+        return torch.from_numpy(np.append(np.sort(others), last))
+
+    def encode(self, context: Context, pairs: Tensor, velocity_scale: Tensor) -> Tensor:
+        """What the network says of every pair, shape [pairs, nodes + collider_nodes, outputs]."""
+        body, path = context.body, context.collider_path
+        frames = self._observed(context)
+        positions, collider = frames[pairs], path[pairs]
+        movement = on_mesh(body, (frames[pairs + 1] - positions) / velocity_scale)
+        features = [movement]
+        if self.task.has_collider:
+            features.insert(0, on_collider(body, path[-1] - collider))
+        graph = build_graph(self.task, body, positions, collider, torch.cat(features, dim=-1))
+        return self.network(graph).unflatten(0, (len(pairs), -1))
+
+    def aggregate(
+        self, latents: Tensor, pairs: Tensor, body: Body, rng: np.random.Generator | None
+    ) -> Tensor:
+        """One description per node from those of all pairs: the element-wise maximum over time."""
+        return latents.amax(0)
+
+    def _observed(self, context: Context) -> Tensor:
+        """The context's frames, noisy if so configured, by the same noise whenever a body is seen again."""
+        if not self.config.context_noise:
+            return context.positions
+        parts = []
+        for frames in context.positions.split(context.body.node_counts, dim=1):
+            seed = zlib.crc32(frames[-1].cpu().numpy().tobytes())
+            noise = np.random.default_rng(seed).standard_normal(frames.shape, dtype=np.float32)
+            parts.append(frames + self.config.context_noise * torch.from_numpy(noise).to(frames.device))
+        observed = torch.cat(parts, dim=1)
+        return torch.where(context.body.fixed[:, None], context.positions, observed)
+
+
+class TrajectorySimulator(nn.Module):
+    """Predicts all nodes' trajectories as movement primitives from one graph (paper, equation 5)."""
+
+    def __init__(self, task: Task, config: PrimitivesConfig, latent_size: int) -> None:
+        super().__init__()
+        self.task = task
+        self.history = bool(task.m3gn_history) if config.history is None else config.history
+        self.network = MessagePassingNetwork(
+            task.node_features + task.collider_features + latent_size + self.history * task.dimension,
+            task.edge_features,
+            task.dimension * (config.basis_functions + 1) + 1,
+            width=config.width,
+            steps=config.message_passing_steps,
         )
         lower, upper = TAU_RANGE
         place = (config.initial_tau - lower) / (upper - lower)
         with torch.no_grad():
-            self.simulator.readout.bias[0] = math.log(place / (1 - place))
+            self.network.readout.bias[0] = math.log(place / (1 - place))
         self.primitives = ProDMP(config.basis_functions, config.alpha, config.alpha_x)
 
-    def predict(self, context: Context) -> Tensor:
-        """Positions after the anchor, shape [horizon, nodes, dim]."""
-        pairs = torch.arange(len(context.positions) - 1, device=context.positions.device)
-        return hold_fixed(context, self._generate(context, self.encode(context, pairs)))
+    def forward(
+        self,
+        context: Context,
+        latent: Tensor,
+        velocity_scale: Tensor,
+        displacement_scale: Tensor,
+    ) -> Tensor:
+        """Positions of mesh nodes after the anchor, shape [horizon, nodes, dim].
 
-    def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
-        """Mean squared error of free nodes after a random anchor, relative to the data's variance."""
-        lower, upper = self.task.training_context
-        context = case.context(int(rng.integers(lower, upper + 1)))
-        last = len(context.positions) - 2
-        others = rng.permutation(last)
-        if self.config.training_context_pairs is not None:
-            others = others[: self.config.training_context_pairs - 1]
-        pairs = np.append(others, last)
-        latent = self.encode(context, torch.from_numpy(pairs).to(case.positions.device))
-        error = self._generate(context, latent) - case.future(len(context.positions))
-        return (error[:, ~case.body.fixed] / self.displacement_scale).square().mean()
-
-    def encode(self, context: Context, pairs: Tensor) -> Tensor:
-        """The task description z [nodes, latent_size] from frames (t, t + 1) for every t in `pairs`."""
-        positions = context.positions[pairs]
-        movement = (context.positions[pairs + 1] - positions) / self.velocity_scale
-        static = static_node_features(context.body).expand(len(pairs), -1, -1)
-        graph = build_graph(context.body, positions, torch.cat([static, movement], dim=-1))
-        latent = self.context_network(graph).unflatten(0, (len(pairs), context.body.nodes))
-        return latent.amax(0)
-
-    def _generate(self, context: Context, latent: Tensor) -> Tensor:
-        """Trajectories of all nodes from the anchor and the task description."""
+        Args:
+            context: its last two frames are the anchor and the one before.
+            latent: task description, shape [nodes + collider_nodes, latent_size].
+            velocity_scale, displacement_scale: units of movements and of the predicted weights.
+        """
+        body, path, now = context.body, context.collider_path, context.size - 1
         anchor = context.positions[-1]
         velocity = anchor - context.positions[-2]
-        features = [static_node_features(context.body), latent]
-        if self.task.m3gn_history:
-            features.append(velocity / self.velocity_scale)
-        graph = build_graph(context.body, anchor[None], torch.cat(features, dim=-1)[None])
-        outputs = self.simulator(graph)
-        weights = outputs[:, 1:].unflatten(1, (self.task.dimension, -1)) * self.displacement_scale
+        features = [latent[None]]
+        if self.task.has_collider:
+            features.insert(0, on_collider(body, path[-1:] - path[now]))
+        if self.history:
+            collider_velocity = path[now] - path[now - 1]
+            features.append(torch.cat([velocity, collider_velocity])[None] / velocity_scale)
+        graph = build_graph(self.task, body, anchor[None], path[now][None], torch.cat(features, dim=-1))
+        outputs = self.network(graph)[: body.nodes]
+        weights = outputs[:, 1:].unflatten(1, (self.task.dimension, -1)) * displacement_scale
 
         # Time runs in whole trajectories of `frames - 1` transitions, whatever the anchor.
         transitions = context.frames - 1
         steps = torch.arange(1, context.horizon + 1, device=anchor.device)
         times = (steps / transitions).to(anchor.dtype)
         lower, upper = TAU_RANGE
-        counts = context.body.node_counts
+        counts = body.node_counts
         trajectories = []
         for logit, w, y, v in zip(
             outputs[:, 0].split(counts),
@@ -119,4 +187,23 @@ class M3GN(Model):
         ):
             tau = lower + (upper - lower) * torch.sigmoid(logit.mean())
             trajectories.append(self.primitives(times, tau, w, y, v * transitions))
-        return torch.cat(trajectories, dim=1)
+        return hold_fixed(context, torch.cat(trajectories, dim=1))
+
+
+class M3GN(TrajectoryModel):
+    """The model; `predict` needs one call of the simulator for the whole horizon."""
+
+    Config = M3GNConfig
+    preset_file = "m3gn.toml"
+    config: M3GNConfig
+    encoder_class: ClassVar[type[ContextEncoder]] = ContextEncoder
+
+    def __init__(self, task: Task, config: M3GNConfig) -> None:
+        super().__init__(task, config)
+        self.encoder = self.encoder_class(task, config)
+        self.simulator = TrajectorySimulator(task, config, config.latent_size)
+
+    def generate(self, context: Context, rng: np.random.Generator | None) -> Tensor:
+        """Positions after the anchor, shape [horizon, nodes, dim]."""
+        latent = self.encoder(context, self.velocity_scale, rng)
+        return self.simulator(context, latent, self.velocity_scale, self.displacement_scale)

@@ -61,7 +61,6 @@ class Model(nn.Module):
     """
 
     Config: ClassVar[type[ModelConfig]] = ModelConfig
-    uses_material: ClassVar[bool] = False
     preset_file: ClassVar[str | None] = None  # in the folder `presets` of the module's package
 
     velocity_scale: Tensor
@@ -97,6 +96,28 @@ class Model(nn.Module):
     def predict(self, context: Context) -> Tensor:
         """Positions in the frames after the anchor, shape [horizon, nodes, dim]."""
         raise NotImplementedError
+
+
+class TrajectoryModel(Model):
+    """A model that predicts whole trajectories at once, trained on whole trajectories.
+
+    A subclass defines `generate`.
+    """
+
+    def generate(self, context: Context, rng: np.random.Generator | None) -> Tensor:
+        """Positions after the anchor, shape [horizon, nodes, dim]; `rng` is None when predicting."""
+        raise NotImplementedError
+
+    def predict(self, context: Context) -> Tensor:
+        """Positions after the anchor, shape [horizon, nodes, dim]."""
+        return self.generate(context, None)
+
+    def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
+        """Mean squared error of free nodes after a random anchor, relative to the data's variance."""
+        lower, upper = self.task.training_context
+        context = case.context(int(rng.integers(lower, upper + 1)))
+        error = self.generate(context, rng) - case.future(context.size)
+        return (error[:, ~case.body.fixed] / self.displacement_scale).square().mean()
 
 
 def hold_fixed(context: Context, positions: Tensor) -> Tensor:

@@ -15,6 +15,8 @@ bounded. Phi_k and its slope are tabulated once, in float64, and interpolated by
 so positions are smooth in tau. Basis functions are scaled to a maximum of one.
 """
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from numpy.polynomial.legendre import leggauss
@@ -36,6 +38,7 @@ def _forcing(s: np.ndarray, functions: int, alpha_x: float) -> np.ndarray:
     return phase * weights / weights.sum(1, keepdims=True)
 
 
+@lru_cache(maxsize=4)
 def _tabulate(functions: int, alpha: float, alpha_x: float, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Phi and dPhi/ds on a uniform grid over [0, end], shape [grid, functions] each.
 

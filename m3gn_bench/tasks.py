@@ -1,13 +1,15 @@
 """The benchmark's tasks: which data, what a model is told about them, how it is scored.
 
-Every ambiguity of the paper that touches features or scoring is decided here:
+What every model is told, and what is scored, is decided here; `docs/models.md` lists all decisions where the
+paper leaves a choice.
 
-- Node features are the node type (one-hot), then static features. In Sheet Deformation these are the nodal
-  force at full load and a flag for clamped nodes (the paper gives two numbers, which it does not name).
+- Node features are the node type (one-hot, where there is a collider: mesh or collider), then static features,
+  then the height where the ground is not part of the graph. In Sheet Deformation the static features are the
+  nodal force at full load and a flag for clamped nodes (the paper gives two numbers, which it does not name).
 - A context of T^c frames are the frames 1..T^c; the last of them is the anchor. Scored are the frames after
   the anchor. Frames count states, so Sheet Deformation has 51 frames and 50 transitions.
 - Nodes whose position is prescribed (clamped) are known to every model and are kept where they are. Errors
-  are given over all nodes, and over free nodes only, which the former dilutes.
+  are given over all nodes, and over free nodes only, which the former dilutes. Collider nodes are not scored.
 """
 
 from collections.abc import Callable
@@ -46,11 +48,11 @@ class Task:
         scene: the generator whose dataset file holds the task's split.
         dimension: of space.
         frames: states per trajectory.
-        node_types: length of the node type's one-hot code.
         static_features: names of the static node features.
         static: computes them from a trajectory, shape [nodes, len(static_features)].
-        edge_types: length of the edge type's one-hot code.
         has_collider: whether a rigid body with a known path takes part.
+        collider_has_edges: whether it has edges of its own (a single grasping point has none).
+        height_feature: whether nodes know their last coordinate, which stands for the ground.
         material: what a model with material information is told.
         context_sizes: numbers of context frames at which the task is scored.
         training_context: smallest and largest number of context frames in training.
@@ -62,25 +64,44 @@ class Task:
     scene: str
     dimension: int
     frames: int
-    node_types: int
     static_features: tuple[str, ...]
     static: Callable[[Trajectory], np.ndarray]
-    edge_types: int
     has_collider: bool
+    collider_has_edges: bool
+    height_feature: bool
     material: tuple[MaterialFeature, ...]
     context_sizes: tuple[int, ...]
     training_context: tuple[int, int]
     m3gn_history: int
 
     @property
+    def node_types(self) -> int:
+        """Length of the node type's one-hot code: mesh, collider."""
+        return 1 + self.has_collider
+
+    @property
+    def edge_types(self) -> int:
+        """Length of the edge type's one-hot code: mesh, collider's own, collider to mesh, mesh to collider."""
+        return 1 + self.collider_has_edges + 2 * self.has_collider
+
+    @property
     def node_features(self) -> int:
-        """Length of the node features that all models share: type, collider displacement, static."""
-        return self.node_types + self.dimension * self.has_collider + len(self.static_features)
+        """Length of the node features that all models share: type, static features, height."""
+        return self.node_types + len(self.static_features) + self.height_feature
+
+    @property
+    def collider_features(self) -> int:
+        """Length of the feature that says where the collider will end, for models that look ahead."""
+        return self.dimension * self.has_collider
 
     @property
     def edge_features(self) -> int:
         """Length of the edge features: type, rest vector and length, current vector and length."""
         return self.edge_types + 2 * (self.dimension + 1)
+
+
+def _no_static_features(trajectory: Trajectory) -> np.ndarray:
+    return np.zeros((len(trajectory.mesh.rest_positions), 0), np.float32)
 
 
 SHEET_FORCE_SCALE = 200.0  # [N], the magnitude of each force
@@ -98,14 +119,33 @@ def _sheet(name: str, title: str) -> Task:
         scene="sheet_deformation",
         dimension=3,
         frames=51,
-        node_types=1,
         static_features=("force", "clamped"),
         static=_sheet_features,
-        edge_types=1,
         has_collider=False,
+        collider_has_edges=False,
+        height_feature=False,
         material=(MaterialFeature("youngs_modulus", 10.0, 1000.0, logarithmic=True),),
         context_sizes=(2, 5, 10),
         training_context=(2, 15),
+        m3gn_history=0,
+    )
+
+
+def _falling(name: str, title: str) -> Task:
+    return Task(
+        name=name,
+        title=title,
+        scene=name,
+        dimension=3,
+        frames=201,
+        static_features=(),
+        static=_no_static_features,
+        has_collider=False,
+        collider_has_edges=False,
+        height_feature=True,
+        material=(MaterialFeature("youngs_modulus", 1e5, 1e6), MaterialFeature("poisson_ratio", 0.0, 0.499)),
+        context_sizes=(10, 20, 30),
+        training_context=(10, 50),
         m3gn_history=0,
     )
 
@@ -115,6 +155,40 @@ TASKS: dict[str, Task] = {
     for task in (
         _sheet("sheet_deformation", "Sheet Deformation"),
         _sheet("sheet_deformation_ood", "Sheet Deformation (OOD)"),
+        Task(
+            name="deformable_block",
+            title="Deformable Block",
+            scene="deformable_block",
+            dimension=2,
+            frames=39,
+            static_features=(),
+            static=_no_static_features,
+            has_collider=True,
+            collider_has_edges=True,
+            height_feature=False,
+            material=(MaterialFeature("poisson_ratio", -0.9, 0.49),),
+            context_sizes=(2, 5, 10),
+            training_context=(2, 15),
+            m3gn_history=1,
+        ),
+        Task(
+            name="tissue_manipulation",
+            title="Tissue Manipulation",
+            scene="tissue_manipulation",
+            dimension=3,
+            frames=101,
+            static_features=(),
+            static=_no_static_features,
+            has_collider=True,
+            collider_has_edges=False,
+            height_feature=False,
+            material=(MaterialFeature("poisson_ratio", -0.9, 0.49),),  # determines Young's modulus
+            context_sizes=(3, 10, 20),
+            training_context=(2, 40),
+            m3gn_history=1,
+        ),
+        _falling("falling_teddy", "Falling Teddy Bear"),
+        _falling("mixed_objects", "Mixed Objects Falling"),
     )
 }
 
