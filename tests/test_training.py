@@ -6,18 +6,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from model_cases import make_case
 from safetensors.torch import load_file
-from test_models import LEARNED, TASK, make_case
 
 import m3gn_bench.training
 from m3gn_bench.checkpoint import Checkpoint, load_checkpoint
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.model import load_preset
+from m3gn_bench.tasks import get_task
 from m3gn_bench.training import STATE, Progress, train
 
-CASES = [make_case(seed) for seed in range(4)]
-HELD_OUT = [make_case(seed) for seed in range(10, 12)]
+TASK = get_task("sheet_deformation")
+LEARNED = ["m3gn", "mgn", "mgn_material"]
+CASES = [make_case(TASK.name, seed) for seed in range(4)]
+HELD_OUT = [make_case(TASK.name, seed) for seed in range(10, 12)]
 
 
 class Killed(BaseException):
