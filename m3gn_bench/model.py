@@ -61,7 +61,8 @@ class Model(nn.Module):
     """
 
     Config: ClassVar[type[ModelConfig]] = ModelConfig
-    preset_file: ClassVar[str | None] = None  # in the folder `presets` of the module's package
+    preset_file: ClassVar[str | None] = None  # in the folder `presets` beside the module that names it
+    variant: ClassVar[dict[str, Any]] = {}  # hyper-parameters that make the model what its name says
 
     velocity_scale: Tensor
     displacement_scale: Tensor
@@ -180,7 +181,8 @@ def load_preset(
     """The configuration of a model's preset for a task.
 
     A preset file is TOML: tables [PRESET.model] and [PRESET.training], and for single tasks
-    [PRESET.task.TASK.model] and [PRESET.task.TASK.training].
+    [PRESET.task.TASK.model] and [PRESET.task.TASK.training]. A subclass shares its parent's file unless it
+    names its own. Later values win: the preset's, the task's, the model's `variant`, the overrides.
 
     Args:
         model_name: a registered model.
@@ -196,7 +198,8 @@ def load_preset(
     model_class = get_model_class(model_name)
     values: dict[str, dict[str, Any]] = {"model": {}, "training": {}}
     if model_class.preset_file is not None:
-        package = model_class.__module__.rpartition(".")[0]
+        owner = next(parent for parent in model_class.__mro__ if "preset_file" in vars(parent))
+        package = owner.__module__.rpartition(".")[0]
         text = (resources.files(package) / "presets" / model_class.preset_file).read_text()
         tables = tomllib.loads(text).get(preset)
         if tables is None:
@@ -204,6 +207,7 @@ def load_preset(
         for layer in (tables, tables.get("task", {}).get(task.name, {})):
             for section in values:
                 values[section] |= layer.get(section, {})
+    values["model"] |= model_class.variant
     known = [f"model.{key}" for key in model_class.Config.model_fields]
     known += [f"training.{key}" for key in TrainingConfig.model_fields]
     for key, value in (overrides or {}).items():
