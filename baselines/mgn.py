@@ -62,7 +62,9 @@ class StepSimulator(nn.Module):
             steps=config.message_passing_steps,
         )
 
-    def forward(self, body: Body, state: State, velocity_scale: Tensor, extra: Tensor | None = None) -> Tensor:
+    def forward(
+        self, body: Body, state: State, velocity_scale: Tensor, extra: Tensor | None = None
+    ) -> Tensor:
         """Next movements in units of `velocity_scale`, shape [moments, nodes, dim].
 
         Args:

@@ -123,7 +123,8 @@ def contact_pairs(body: Body, positions: Tensor, collider: Tensor) -> Tensor:
         # One more coordinate keeps bodies and moments apart, so a single tree serves all of them.
         group = np.arange(moments)[:, None] * bodies + body_of_point.cpu().numpy()
         flat = points.detach().cpu().numpy().astype(np.float64)
-        return cKDTree(np.concatenate([flat, 2 * CONTACT_RADIUS * group[..., None]], -1).reshape(-1, flat.shape[-1] + 1))
+        apart = np.concatenate([flat, 2 * CONTACT_RADIUS * group[..., None]], axis=-1)
+        return cKDTree(apart.reshape(-1, apart.shape[-1]))
 
     found = tree(positions, body.body_of_node).sparse_distance_matrix(
         tree(collider, body.body_of_collider_node), CONTACT_RADIUS, output_type="ndarray"

@@ -150,20 +150,25 @@ class TrajectorySimulator(nn.Module):
         latent: Tensor,
         velocity_scale: Tensor,
         displacement_scale: Tensor,
+        segment: int | None = None,
     ) -> Tensor:
-        """Positions of mesh nodes after the anchor, shape [horizon, nodes, dim].
+        """Positions of mesh nodes after the anchor, shape [min(segment, horizon), nodes, dim].
 
         Args:
             context: its last two frames are the anchor and the one before.
             latent: task description, shape [nodes + collider_nodes, latent_size].
             velocity_scale, displacement_scale: units of movements and of the predicted weights.
+            segment: transitions to predict, which are then the primitives' unit of time; None: all that are
+                left, in units of a whole trajectory, whatever the anchor.
         """
         body, path, now = context.body, context.collider_path, context.size - 1
+        unit = context.frames - 1 if segment is None else segment
+        steps = min(unit, context.horizon)
         anchor = context.positions[-1]
         velocity = anchor - context.positions[-2]
         features = [latent[None]]
         if self.task.has_collider:
-            features.insert(0, on_collider(body, path[-1:] - path[now]))
+            features.insert(0, on_collider(body, path[now + steps][None] - path[now]))
         if self.history:
             collider_velocity = path[now] - path[now - 1]
             features.append(torch.cat([velocity, collider_velocity])[None] / velocity_scale)
@@ -171,10 +176,7 @@ class TrajectorySimulator(nn.Module):
         outputs = self.network(graph)[: body.nodes]
         weights = outputs[:, 1:].unflatten(1, (self.task.dimension, -1)) * displacement_scale
 
-        # Time runs in whole trajectories of `frames - 1` transitions, whatever the anchor.
-        transitions = context.frames - 1
-        steps = torch.arange(1, context.horizon + 1, device=anchor.device)
-        times = (steps / transitions).to(anchor.dtype)
+        times = (torch.arange(1, steps + 1, device=anchor.device) / unit).to(anchor.dtype)
         lower, upper = TAU_RANGE
         counts = body.node_counts
         trajectories = []
@@ -186,7 +188,7 @@ class TrajectorySimulator(nn.Module):
             strict=True,
         ):
             tau = lower + (upper - lower) * torch.sigmoid(logit.mean())
-            trajectories.append(self.primitives(times, tau, w, y, v * transitions))
+            trajectories.append(self.primitives(times, tau, w, y, v * unit))
         return hold_fixed(context, torch.cat(trajectories, dim=1))
 
 

@@ -69,4 +69,4 @@ class MessagePassingNetwork(nn.Module):
         edges = self.embed_edges(graph.edge_features)
         for block in self.blocks:
             nodes, edges = block(nodes, edges, graph)
-        return self.readout(functional.leaky_relu(self.hidden(nodes)))
+        return self.readout(functional.leaky_relu(self.hidden(nodes))).float()  # also under autocast

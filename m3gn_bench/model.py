@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib import resources
 from importlib.metadata import entry_points
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -45,6 +45,9 @@ class TrainingConfig(ModelConfig):
     cosine_decay: bool = True  # to zero at the end of the budget; constant otherwise
     weight_decay: float = Field(default=0.0, ge=0)
     gradient_clip: float | None = Field(default=None, gt=0)  # on the global norm
+    precision: Literal["float32", "bfloat16"] = (
+        "float32"  # of matrix products in training; weights are float32
+    )
     validations: int = Field(default=10, ge=1)  # over the whole budget; the best one is kept
     validation_trajectories: int = Field(default=18, ge=1)
 

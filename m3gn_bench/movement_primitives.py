@@ -111,7 +111,8 @@ class ProDMP(nn.Module):
         goal = 1 - (1 + a * s) * fade
         basis = torch.cat([self._interpolate(s), goal[:, None]], dim=-1)
         free = (tau * s * fade).reshape(-1, *[1] * position.dim()) * velocity
-        shaped = torch.tensordot(basis, weights, dims=([1], [-1]))
+        with torch.autocast(times.device.type, enabled=False):  # positions need float32's digits
+            shaped = torch.tensordot(basis, weights, dims=([1], [-1]))
         return position + free + shaped
 
     def _interpolate(self, s: Tensor) -> Tensor:

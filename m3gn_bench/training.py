@@ -163,7 +163,10 @@ class _Run:
         self.progress = Progress()
         self.rng = np.random.default_rng(seed)
         self.optimizer = torch.optim.AdamW(
-            model.parameters(), lr=self.training.learning_rate, weight_decay=self.training.weight_decay
+            model.parameters(),
+            lr=self.training.learning_rate,
+            weight_decay=self.training.weight_decay,
+            fused=True,  # one pass over all weights; otherwise a sixth of a small model's step
         )
         self.best_weights = {name: value.clone() for name, value in model.state_dict().items()}
 
@@ -173,7 +176,11 @@ class _Run:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
         self.optimizer.zero_grad(set_to_none=True)
-        loss = self.model.training_loss(join([cases[i] for i in chosen]), self.rng)
+        batch = join([cases[i] for i in chosen])
+        with torch.autocast(
+            batch.positions.device.type, torch.bfloat16, enabled=self.training.precision == "bfloat16"
+        ):
+            loss = self.model.training_loss(batch, self.rng)
         loss.backward()
         if self.training.gradient_clip is not None:
             nn.utils.clip_grad_norm_(self.model.parameters(), self.training.gradient_clip)
