@@ -1,0 +1,50 @@
+"""What the neural operators share: features over items (nodes or edges) and times, shape [items, times, width].
+
+Times lie next to each other for every item, so gathering a node for an edge copies one long row, and a
+convolution over time sees the layout that it is fastest in.
+"""
+
+import torch
+from torch import Tensor, nn
+
+TIME_FEATURES = 32  # (paper's parameter counts)
+
+
+def time_embedding(frames: Tensor, anchor: int) -> Tensor:
+    """Sines and cosines of each frame's number and of its distance from the anchor, shape [times, 32].
+
+    The wavelengths are those of Vaswani et al. 2017. The published counts fix the length only. One half each
+    for both numbers, because loads follow the first and what is predicted vanishes where the second is zero.
+
+    Args:
+        frames: numbers of frames, shape [times], int.
+        anchor: number of the anchor's frame.
+    """
+    waves = TIME_FEATURES // 4
+    frequencies = 10_000.0 ** (-torch.arange(waves, device=frames.device) / waves)
+    angles = torch.cat([frames[:, None] * frequencies, (frames - anchor)[:, None] * frequencies], dim=-1)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class SpaceTimeLinear(nn.Module):
+    """A linear layer on the concatenation of features per item, per item and time, and per time.
+
+    The three products are taken before they are spread over items and times, so nothing is concatenated.
+
+    Args:
+        static, moving, timed: lengths of the three features.
+        width: length of the output.
+    """
+
+    def __init__(self, static: int, moving: int, timed: int, width: int) -> None:
+        super().__init__()
+        self.static = nn.Linear(static, width)
+        self.moving = nn.Linear(moving, width, bias=False)
+        self.timed = nn.Linear(timed, width, bias=False)
+
+    def forward(self, static: Tensor, moving: Tensor, timed: Tensor) -> Tensor:
+        """Shape [items, times, width] from [items, static], [items, times, moving] and [times, timed]."""
+        out = self.moving(moving)
+        out += self.static(static)[:, None]
+        out += self.timed(timed)
+        return out
