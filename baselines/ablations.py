@@ -195,9 +195,10 @@ class BayesianEncoder(ContextEncoder):
         self, latents: Tensor, pairs: Tensor, body: Body, rng: np.random.Generator | None
     ) -> Tensor:
         """A sample of z (its mean when predicting), shape [nodes + collider_nodes, latent_size]."""
-        observations, spread = latents.chunk(2, dim=-1)
+        # Sums of precisions in float32, whatever precision the network works in.
+        observations, spread = latents.float().chunk(2, dim=-1)
         variances = functional.softplus(spread) + MINIMUM_VARIANCE
-        mean, variance = bayesian_aggregation(observations, variances, pair_weights(pairs).to(latents))
+        mean, variance = bayesian_aggregation(observations, variances, pair_weights(pairs))
         if rng is None:
             return mean
         drawn = rng.standard_normal(mean.shape, dtype=np.float32)
@@ -213,8 +214,8 @@ def pair_weights(pairs: Tensor) -> Tensor:
     """
     read, present = len(pairs), int(pairs[-1]) + 1
     if read == 1:
-        return torch.full((1,), float(present))
-    weights = torch.full((read,), (present - 1) / (read - 1))
+        return torch.full((1,), float(present), device=pairs.device)
+    weights = torch.full((read,), (present - 1) / (read - 1), device=pairs.device)
     weights[-1] = 1
     return weights
 
