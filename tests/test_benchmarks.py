@@ -1,0 +1,66 @@
+"""What `benchmarks` compares computes the same."""
+
+import numpy as np
+import pytest
+import torch
+from model_cases import make_case, training_cases
+from training_step import loss, pair_of_models, time_steps
+from usual_m3gn import PlainM3GN
+
+from m3gn_bench.m3gn import M3GN
+from m3gn_bench.tasks import get_task
+
+WITHOUT_AND_WITH_COLLIDER = ("sheet_deformation", "deformable_block")
+
+
+def models(kind: str) -> tuple[M3GN, PlainM3GN]:
+    return pair_of_models(get_task(kind), "smoke", training_cases(kind))
+
+
+def relative_difference(found: list[torch.Tensor], expected: list[torch.Tensor]) -> float:
+    largest = max(float(value.abs().max()) for value in expected)
+    return max(float((a - b).abs().max()) for a, b in zip(found, expected, strict=True)) / largest
+
+
+@pytest.mark.parametrize("context", [2, 5])
+@pytest.mark.parametrize("kind", WITHOUT_AND_WITH_COLLIDER)
+def test_usual_m3gn_is_the_same_function(kind: str, context: int) -> None:
+    ours, usual = models(kind)
+    case = make_case(kind, 3)
+    with torch.inference_mode():
+        expected = ours.predict(case.context(context))
+        found = usual.predict(case.context(context))
+    moved = expected - case.positions[context - 1]
+    assert float((found - expected).abs().max()) < 1e-5 * float(moved.abs().max())
+
+
+@pytest.mark.parametrize("context", [2, 5])
+@pytest.mark.parametrize("kind", WITHOUT_AND_WITH_COLLIDER)
+def test_usual_m3gn_has_the_same_gradients(kind: str, context: int) -> None:
+    ours, usual = models(kind)
+    case = make_case(kind, 3)
+    losses = [loss(model, case, context) for model in (ours, usual)]
+    for value in losses:
+        value.backward()
+    assert losses[1].item() == pytest.approx(losses[0].item(), rel=1e-5)
+    expected = {name: weight.grad for name, weight in ours.named_parameters() if weight.grad is not None}
+    found = usual.gradients()
+    assert set(found) == set(expected)
+    assert relative_difference([found[name] for name in expected], list(expected.values())) < 1e-5
+
+
+def test_both_take_the_same_training_steps() -> None:
+    """After three timed steps of each, the same prediction: what is timed is training, of both alike."""
+    kind = "sheet_deformation"
+    ours, usual = models(kind)
+    case = make_case(kind, 3)
+    before = ours.predict(case.context(5)).detach()
+    seconds = time_steps({"ours": ours, "usual": usual}, case, 5, 1)
+    after = [model.predict(case.context(5)).detach() for model in (ours, usual)]
+    assert all(len(values) == 1 for clocks in seconds.values() for values in clocks.values())
+    assert np.all(
+        [value > 0 for clocks in seconds.values() for values in clocks.values() for value in values]
+    )
+    step = float((after[0] - before).abs().max())
+    assert step > 0
+    assert float((after[1] - after[0]).abs().max()) < 0.01 * step
