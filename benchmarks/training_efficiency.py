@@ -1,0 +1,148 @@
+"""What each device of training brings, in steps per second and in error after the same time on one core.
+
+M3GN's compact preset is trained as it is, and with one thing changed at a time. Every run is appended to a file
+as it ends, and a run that the file has is not repeated; the table is made from the file.
+"""
+
+import argparse
+import json
+import multiprocessing
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from rich.console import Console
+from usual_m3gn import PlainM3GN
+
+from m3gn_bench import checkpoint, training
+from m3gn_bench.console import table
+from m3gn_bench.data import Body, load_cases
+from m3gn_bench.evaluation import evaluate_model
+from m3gn_bench.m3gn import M3GN
+from m3gn_bench.model import Model, RunConfig, build_model, load_preset
+from m3gn_bench.sources import find_or_generate
+from m3gn_bench.tasks import Task, get_task
+
+Exchange = Callable[[], AbstractContextManager[Any]]
+
+
+@contextmanager
+def usual_layers() -> Iterator[None]:
+    """Concatenate, per-edge linear layer, scatter."""
+
+    def build(config: RunConfig, task: Task, seed: int = 0) -> Model:
+        model = build_model(config, task, seed)
+        assert isinstance(model, M3GN)
+        return PlainM3GN(model)
+
+    with patch.object(training, "build_model", build), patch.object(checkpoint, "build_model", build):
+        yield
+
+
+def rebuilt_static_parts() -> AbstractContextManager[Any]:
+    """Rest vectors of the mesh computed whenever they are needed."""
+    return patch.object(Body, "rest_vectors", property(Body.rest_vectors.func))
+
+
+def plain_optimiser() -> AbstractContextManager[Any]:
+    """AdamW tensor by tensor."""
+    adamw = torch.optim.AdamW
+    return patch.object(
+        torch.optim, "AdamW", lambda *given, **options: adamw(*given, **{**options, "fused": False})
+    )
+
+
+def no_loss_scaling() -> AbstractContextManager[Any]:
+    """Losses and movements in scaled coordinates, not in units of the data's spread."""
+    return patch.object(Model, "prepare", lambda self, cases: None)
+
+
+# name in the table, what is overridden, what is exchanged in the code
+VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
+    "as it is": ({}, None),
+    "usual edge layer": ({}, usual_layers),
+    "all context pairs": ({"model.training_context_pairs": None}, None),
+    "one trajectory per step": ({"training.batch_size": 1}, None),
+    "four trajectories per step": ({"training.batch_size": 4}, None),
+    "bfloat16 products": ({"training.precision": "bfloat16"}, None),
+    "constant learning rate": ({"training.cosine_decay": False}, None),
+    "no loss scaling": ({}, no_loss_scaling),
+    "static parts rebuilt": ({}, rebuilt_static_parts),
+    "optimiser not fused": ({}, plain_optimiser),
+}
+
+
+def run(task_name: str, variant: str, minutes: float, seed: int, data: Path) -> dict[str, Any]:
+    """Train one variant and score it on all validation trajectories."""
+    torch.set_num_threads(1)
+    task = get_task(task_name)
+    overrides, exchange = VARIANTS[variant]
+    path = find_or_generate(task, "paper", data)
+    train_cases, validation_cases = (load_cases(path, task, split) for split in ("train", "validation"))
+    settings = {"training.minutes": minutes, "training.validations": 4}
+    config = load_preset("m3gn", "compact", task, settings | overrides)
+    with ExitStack() as stack:
+        if exchange is not None:
+            stack.enter_context(exchange())
+        out = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        done = training.train(config, task, train_cases, validation_cases, out, seed=seed, dataset_hash="")
+        model, _ = checkpoint.load_checkpoint(out)
+        errors = evaluate_model(model, validation_cases, task.context_sizes)
+    return {
+        "task": task_name,
+        "variant": variant,
+        "minutes": minutes,
+        "seed": seed,
+        "steps": done.steps,
+        "steps_per_second": done.steps / (60 * done.minutes),
+        "validation_mse": {size: float(error.mse.mean()) for size, error in errors.items()},
+    }
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", default="sheet_deformation,deformable_block,falling_teddy")
+    parser.add_argument("--variants", default=",".join(VARIANTS))
+    parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--data", type=Path, default=Path("data"))
+    parser.add_argument("--results", type=Path, default=Path("training_efficiency.jsonl"))
+    options = parser.parse_args()
+
+    def recorded() -> list[dict[str, Any]]:
+        text = options.results.read_text() if options.results.is_file() else ""
+        return [json.loads(line) for line in text.splitlines()]
+
+    plan = [(task, name) for task in options.tasks.split(",") for name in options.variants.split(",")]
+    for task, variant in plan:
+        key = (task, variant, options.minutes, options.seed)
+        if any((r["task"], r["variant"], r["minutes"], r["seed"]) == key for r in recorded()):
+            continue
+        # A process of its own: nothing exchanged in the code survives, and memory starts afresh.
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            result = pool.apply(run, (*key, options.data))
+        with options.results.open("a") as file:
+            file.write(json.dumps(result) + "\n")
+    for task in options.tasks.split(","):
+        rows = [r for r in recorded() if (r["task"], r["minutes"]) == (task, options.minutes)]
+        sizes = get_task(task).context_sizes
+        Console().print(
+            table(
+                f"{task}, {options.minutes:g} minutes on one core",
+                ["variant", "seed", "steps/s", *(f"1e3 MSE at {size}" for size in sizes)],
+                [
+                    [r["variant"], str(r["seed"]), f"{r['steps_per_second']:.1f}"]
+                    + [f"{1e3 * r['validation_mse'][str(size)]:.3g}" for size in sizes]
+                    for r in rows
+                ],
+            )
+        )
+
+
+if __name__ == "__main__":
+    main()
