@@ -37,7 +37,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from m3gn_bench.baselines.spacetime import TIME_FEATURES, time_embedding
+from m3gn_bench.baselines.spacetime import TIME_FEATURES, edges_at_a_time, time_embedding
 from m3gn_bench.data import Body, Case, Context
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.graph import Graph, build_graph, on_collider
@@ -120,7 +120,8 @@ class EquivariantLayer(nn.Module):
         self.vector_convolution = SpectralConvolution(2, times, modes, 1e-3)
         self.distance_linear = nn.Linear(1, width)
         self.edge_linear = nn.Linear(edge_features, width, bias=False)
-        self.endpoint_linear = nn.Linear(width, 2 * width, bias=False)  # sender's and receiver's part
+        self.sender_linear = nn.Linear(width, width, bias=False)
+        self.receiver_linear = nn.Linear(width, width, bias=False)
         self.message_linear = nn.Linear(width, width)
         self.vector_scalar = _scalar_network(width)
         self.velocity_scalar = _scalar_network(width)
@@ -136,30 +137,45 @@ class EquivariantLayer(nn.Module):
             vectors: position minus mean and velocity of mesh nodes, shape [nodes, dim, times, 2].
             scene: the rest.
         """
-        # In place where autograd allows it: on a CPU this is bound by memory, not by arithmetic.
-        nodes = nodes + functional.leaky_relu_(self.convolution(nodes))
+        # In place where autograd allows it: on a CPU this is bound by memory, not by arithmetic. It does so at
+        # a cost for views, hence the flattened inputs of linear layers.
+        nodes = nodes + functional.leaky_relu(self.convolution(nodes))
         vectors = vectors + self.vector_convolution(vectors.flatten(0, 1)).view_as(vectors)
         position, velocity = vectors.transpose(1, 2).unbind(-1)
 
-        graph = scene.graph
-        places = torch.cat([position, scene.collider])
-        between = places[graph.receivers] - places[graph.senders]
-        change = between.square().sum(-1, keepdim=True) - scene.squared_distances
-        sender, receiver = self.endpoint_linear(nodes).chunk(2, dim=-1)
-        message = self.distance_linear(change / scene.edge_length**2)
-        message += self.edge_linear(scene.edge_features)[:, None]
-        message += sender.index_select(0, graph.senders)
-        message += receiver.index_select(0, graph.receivers)
-        message = functional.leaky_relu_(self.message_linear(functional.leaky_relu_(message)))
-
-        received = _mean(message, graph)
-        pulled = _mean(between / scene.edge_length * self.vector_scalar(message), graph)
-        update = self.node_linear(nodes)
-        update += self.received_linear(received)
-        nodes = nodes + self.node_readout(functional.leaky_relu_(update))
+        received, pulled = self._exchange(nodes, torch.cat([position, scene.collider]), scene)
+        update = self.node_linear(nodes.flatten(0, 1))
+        update += self.received_linear(received.flatten(0, 1))
+        nodes = nodes + self.node_readout(functional.leaky_relu_(update)).view_as(nodes)
         mesh = len(position)
         position = position + velocity * self.velocity_scalar(nodes[:mesh]) + pulled[:mesh]
         return nodes, torch.stack([position, velocity], dim=-1).transpose(1, 2)
+
+    def _exchange(self, nodes: Tensor, places: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
+        """Means over incoming edges of messages and of scaled vectors, shape [nodes, times, width or dim]."""
+        graph = scene.graph
+        sender, receiver = self.sender_linear(nodes), self.receiver_linear(nodes)
+        received, pulled = torch.zeros_like(nodes), torch.zeros_like(places)
+        for senders, receivers, features, distances in zip(
+            *(
+                values.split(edges_at_a_time(graph, *nodes.shape[1:]))
+                for values in (graph.senders, graph.receivers, scene.edge_features, scene.squared_distances)
+            ),
+            strict=True,
+        ):
+            between = places.index_select(0, receivers) - places.index_select(0, senders)
+            change = between.square().sum(-1, keepdim=True) - distances
+            message = sender.index_select(0, senders)
+            message += receiver.index_select(0, receivers)
+            message += self.edge_linear(features)[:, None]
+            message += self.distance_linear(change / scene.edge_length**2)
+            message = self.message_linear(functional.leaky_relu_(message).flatten(0, 1))
+            message = functional.leaky_relu_(message)
+            scalar = self.vector_scalar(message).view_as(change)
+            received.index_add_(0, receivers, message.view(len(senders), *nodes.shape[1:]))
+            pulled.index_add_(0, receivers, between * (scalar / scene.edge_length))
+        mean = graph.inverse_degree[:, None]
+        return received * mean, pulled * mean
 
 
 class EGNO(TrajectoryModel):
@@ -231,12 +247,6 @@ class EGNO(TrajectoryModel):
 def body_means(body: Body, positions: Tensor) -> Tensor:
     """Mean position of each body's mesh nodes, shape [bodies, dim], from [nodes, dim]."""
     return torch.stack([part.mean(0) for part in positions.split(body.node_counts)])
-
-
-def _mean(messages: Tensor, graph: Graph) -> Tensor:
-    """Mean over the incoming edges of every node, shape [nodes, ...], from [edges, ...]."""
-    summed = messages.new_zeros(len(graph.inverse_degree), *messages.shape[1:])
-    return summed.index_add_(0, graph.receivers, messages) * graph.inverse_degree[:, None]
 
 
 def _length_only(vectors: Tensor) -> Tensor:

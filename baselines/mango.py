@@ -22,13 +22,15 @@ Decisions where the paper and its parameter counts leave a choice:
 - The output is the displacement from the anchor in units of its standard deviation in the training data.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from m3gn_bench.baselines.spacetime import TIME_FEATURES, SpaceTimeLinear, time_embedding
+from m3gn_bench.baselines.spacetime import TIME_FEATURES, SpaceTimeLinear, edges_at_a_time, time_embedding
 from m3gn_bench.data import Context
 from m3gn_bench.graph import Graph, build_graph, shared_node_features
 from m3gn_bench.model import ModelConfig, TrajectoryModel, hold_fixed
@@ -45,19 +47,19 @@ class MaNGOConfig(ModelConfig):
 
 
 class TemporalConvolution(nn.Module):
-    """A convolution over time, the same for every item, padded with zeros to keep the length."""
+    """A convolution over time, the same for every item, padded with zeros to keep the length; then LeakyReLU."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.conv = nn.Conv1d(width, width, KERNEL, padding=KERNEL // 2)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features [items, times, width] convolved over time."""
+        """Features [items, times, width] to the same shape."""
         # Seen as pictures of one row whose channels lie together, they need no reordering on a CPU.
         pictures = features.transpose(1, 2)[:, :, None]
         weight = self.conv.weight[:, :, None]
         out = functional.conv2d(pictures, weight, self.conv.bias, padding=(0, KERNEL // 2))
-        return out[:, :, 0].transpose(1, 2)
+        return functional.leaky_relu_(out)[:, :, 0].transpose(1, 2)
 
 
 class SpaceTimeBlock(nn.Module):
@@ -67,25 +69,37 @@ class SpaceTimeBlock(nn.Module):
         super().__init__()
         self.convolution = TemporalConvolution(width)
         self.edge_linear = nn.Linear(width, width)
-        self.endpoint_linear = nn.Linear(width, 2 * width, bias=False)  # sender's and receiver's part
+        self.sender_linear = nn.Linear(width, width, bias=False)
+        self.receiver_linear = nn.Linear(width, width, bias=False)
         self.edge_norm = nn.LayerNorm(width)
         self.node_linear = nn.Linear(width, width)
         self.message_linear = nn.Linear(width, width, bias=False)
         self.node_norm = nn.LayerNorm(width)
 
-    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
-        """Update nodes [nodes, times, width] and edges [edges, times, width]."""
-        # In place where autograd allows it: on a CPU this is bound by memory, not by arithmetic.
-        nodes = nodes + functional.leaky_relu_(self.convolution(nodes))
-        sender, receiver = self.endpoint_linear(nodes).chunk(2, dim=-1)
-        message = self.edge_linear(edges)
-        message += sender.index_select(0, graph.senders)
-        message += receiver.index_select(0, graph.receivers)
-        edges = self.edge_norm(functional.leaky_relu_(message)).add_(edges)
-        summed = torch.zeros_like(nodes).index_add_(0, graph.receivers, edges)
-        update = self.node_linear(nodes)
-        update += self.message_linear(summed * graph.inverse_degree[:, None])
-        return self.node_norm(functional.leaky_relu_(update)).add_(nodes), edges
+    def forward(self, nodes: Tensor, edges: Sequence[Tensor], graph: Graph) -> tuple[Tensor, list[Tensor]]:
+        """Update nodes [nodes, times, width], and edges in parts of shape [edges, times, width]."""
+        # In place where autograd allows it: on a CPU this is bound by memory, not by arithmetic. It does so at
+        # a cost for views, hence the flattened inputs of linear layers.
+        nodes = nodes + self.convolution(nodes)
+        sender, receiver = self.sender_linear(nodes), self.receiver_linear(nodes)
+        size = len(edges[0])
+        updated = []
+        summed = torch.zeros_like(nodes)
+        for part, senders, receivers in zip(
+            edges, graph.senders.split(size), graph.receivers.split(size), strict=True
+        ):
+            message = self.edge_linear(part.flatten(0, 1))
+            message += sender.index_select(0, senders).flatten(0, 1)
+            message += receiver.index_select(0, receivers).flatten(0, 1)
+            change = self.edge_norm(functional.leaky_relu_(message))
+            change += part.flatten(0, 1)
+            updated.append(change.view_as(part))
+            summed.index_add_(0, receivers, updated[-1])
+        update = self.node_linear(nodes.flatten(0, 1))
+        update += self.message_linear((summed * graph.inverse_degree[:, None]).flatten(0, 1))
+        update = self.node_norm(functional.leaky_relu_(update))
+        update += nodes.flatten(0, 1)
+        return update.view_as(nodes), updated
 
 
 class MaNGO(TrajectoryModel):
@@ -113,7 +127,9 @@ class MaNGO(TrajectoryModel):
         frames = torch.arange(context.frames, device=anchor.device)
         times = time_embedding(frames, size - 1)
         nodes = self.embed_nodes(self._node_inputs(context, times))
-        edges = self.embed_edges(graph.edge_features, self._edge_inputs(context, graph), times)
+        some = edges_at_a_time(graph, context.frames, self.config.width)
+        parts = graph.edge_features.split(some), self._edge_inputs(context, graph).split(some)
+        edges = [self.embed_edges(static, moving, times) for static, moving in zip(*parts, strict=True)]
         for block in self.blocks:
             nodes, edges = block(nodes, edges, graph)
         outputs = self.readout(functional.relu(self.hidden(nodes[: body.nodes, size:])))
