@@ -228,7 +228,9 @@ def case_from(task: Task, scaling: Scaling, trajectory: Trajectory, key: str) ->
     collider_edges = trajectory.collider_edges
     material = [feature(trajectory.material[feature.name]) for feature in task.material]
     body = Body(
-        rest_positions=scaled(trajectory.mesh.rest_positions),
+        # The first frame, not the stress-free shape: whoever watches a body that has a history (Deformable
+        # Block) does not know it, and it would give the material away.
+        rest_positions=scaled(trajectory.positions[0]),
         edges=torch.from_numpy(mesh_edges(trajectory.mesh.cells)),
         static_features=torch.from_numpy(task.static(trajectory)),
         fixed=torch.from_numpy(trajectory.mesh.node_type == FIXED),

@@ -28,6 +28,8 @@ class ContextConfig(ModelConfig):
 
     width: int = Field(default=128, ge=1)
     message_passing_steps: int = Field(default=15, ge=1)
+    # Of the context network, where it needs fewer than the simulator; None: as many.
+    context_message_passing_steps: int | None = Field(default=None, ge=1)
     latent_size: int = Field(default=64, ge=1)  # of the task description z
     # Context pairs encoded per training step: the last one and some others at random; all of them when
     # predicting. The maximum over time does not mind missing pairs, and encoding all would take most of a
@@ -71,7 +73,7 @@ class ContextEncoder(nn.Module):
             task.edge_features,
             self.outputs_per_latent * config.latent_size,
             width=config.width,
-            steps=config.message_passing_steps,
+            steps=config.context_message_passing_steps or config.message_passing_steps,
         )
 
     def forward(self, context: Context, velocity_scale: Tensor, rng: np.random.Generator | None) -> Tensor:
