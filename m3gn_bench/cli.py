@@ -5,17 +5,21 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from m3gn_bench.console import Report, table
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.version import __version__
+
+if TYPE_CHECKING:
+    from m3gn_bench.profiling import Profile, Ratios
 
 # Modules that need torch or a simulator are imported inside the commands, so that --help stays instant.
 
@@ -25,6 +29,12 @@ DATA = click.option(
     type=click.Path(path_type=Path, file_okay=False),
     default=lambda: Path(os.environ.get("M3GN_BENCH_DATA", "data")),
     help="Folder of dataset files.  [default: $M3GN_BENCH_DATA, or ./data]",
+)
+THREADS = click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    default=os.cpu_count() or 1,
+    help="Of torch.  [default: all cores]",
 )
 WORKERS = click.option(
     "--workers", type=int, default=os.cpu_count() or 1, help="Processes that simulate.  [default: all cores]"
@@ -63,7 +73,9 @@ def list_command(as_json: bool) -> None:
     """Scenes, tasks, tiers, models and presets, with the number of parameters of each."""
     from m3gn_bench.datasets.schema import TIERS, tier_sizes
     from m3gn_bench.generators.scene import get_scene, scene_names
-    from m3gn_bench.model import PRESETS, build_model, load_preset, model_names
+    from m3gn_bench.model import PRESETS, model_names
+    from m3gn_bench.published import published_parameters
+    from m3gn_bench.sizes import parameter_counts
     from m3gn_bench.tasks import TASKS
 
     scenes: list[dict[str, Any]] = [
@@ -96,18 +108,24 @@ def list_command(as_json: bool) -> None:
         for task in TASKS.values()
         for scene in [get_scene(task.scene)]
     ]
+    counts = parameter_counts()
     models = [
         {
             "name": name,
             "preset": preset,
-            "task": task.name,
-            "parameters": build_model(load_preset(name, preset, task), task).parameter_count(),
+            "task": task,
+            "parameters": count,
+            "published_parameters": published_parameters(task, name, preset),
         }
-        for task in TASKS.values()
-        for name in model_names()
-        for preset in PRESETS
+        for (name, preset, task), count in counts.items()
     ]
-    counts = {(m["name"], m["preset"], m["task"]): m["parameters"] for m in models}
+
+    def shown_count(name: str, preset: str, task: str) -> str:
+        published, count = published_parameters(task, name, preset), counts[name, preset, task]
+        if published is None:
+            return str(count)
+        return f"{count} = paper" if published == count else f"{count}, paper {published}"
+
     Report(as_json).finish(
         {
             "scenes": scenes,
@@ -147,7 +165,7 @@ def list_command(as_json: bool) -> None:
             "Models: trainable parameters",
             ["model", "task", *PRESETS],
             [
-                [name, task, *(counts[name, p, task] for p in PRESETS)]
+                [name, task, *(shown_count(name, p, task) for p in PRESETS)]
                 for name in model_names()
                 for task in TASKS
             ],
@@ -539,12 +557,7 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     default=None,
     help="Also write a result record below this folder (in a checkout: leaderboard).",
 )
-@click.option(
-    "--threads",
-    type=click.IntRange(min=1),
-    default=os.cpu_count() or 1,
-    help="Of torch.  [default: all cores]",
-)
+@THREADS
 @WORKERS
 @DATA
 @JSON
@@ -722,6 +735,132 @@ def _parse_contexts(text: str) -> list[int]:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise click.BadParameter(f"--contexts {text!r} is no list of numbers such as 2,5,10") from None
+
+
+@cli.command()
+@click.option("--task", "task_name", required=True, help="What to predict.")
+@click.option(
+    "--model", "models", required=True, multiple=True, help="Which model (may be given several times)."
+)
+@click.option("--preset", default="paper", show_default=True, help="smoke, compact or paper.")
+@click.option("--context", type=int, default=None, help="Context frames.  [default: the task's fewest]")
+@click.option("--tier", default="smoke", show_default=True, help="Which test trajectories.")
+@click.option(
+    "--trajectories", type=click.IntRange(min=1), default=4, show_default=True, help="How many of them."
+)
+@click.option(
+    "--repetitions", type=click.IntRange(min=1), default=5, show_default=True, help="Of every timing."
+)
+@click.option("--device", default="cpu", show_default=True, help="A torch device.")
+@THREADS
+@WORKERS
+@DATA
+@JSON
+def profile(
+    task_name: str,
+    models: tuple[str, ...],
+    preset: str,
+    context: int | None,
+    tier: str,
+    trajectories: int,
+    repetitions: int,
+    device: str,
+    threads: int,
+    workers: int,
+    data: Path,
+    as_json: bool,
+) -> None:
+    """Time and memory that predictions take, beside M3GN's in the same run.
+
+    One trajectory at a time, and in the batches that take least time per trajectory. Models are untrained: time
+    does not depend on how good their weights are. Test trajectories are simulated first if they are not there yet.
+    """
+    import torch
+
+    from m3gn_bench.data import load_cases
+    from m3gn_bench.model import get_model_class
+    from m3gn_bench.profiling import profile_models, ratios
+    from m3gn_bench.published import published_parameters
+    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.tasks import get_task
+    from m3gn_bench.training import usable_device
+
+    report = Report(as_json)
+    torch.set_num_threads(threads)
+    task = get_task(task_name)
+    for name in models:
+        get_model_class(name)
+    where = usable_device(device)
+    with report.progress(f"simulating {task.scene}") as on_progress:
+        path = find_or_generate(
+            task, tier, data, splits=("train", "test"), workers=workers, on_progress=on_progress
+        )
+    cases = load_cases(path, task, "test", tier)[:trajectories]
+    frames = task.context_sizes[0] if context is None else context
+    with report.progress("profiling") as on_progress:
+        profiles = profile_models(
+            models,
+            task,
+            preset,
+            cases,
+            frames,
+            training_cases=lambda: load_cases(path, task, "train", tier),
+            repetitions=repetitions,
+            device=where,
+            on_progress=on_progress,
+        )
+    compared = list(zip(profiles, ratios(profiles), strict=True))
+
+    def row(label: str, number: "Callable[[Profile, Ratios], str]") -> list[object]:
+        return [label, *(number(p, r) for p, r in compared)]
+
+    report.finish(
+        {
+            "task": task.name,
+            "preset": preset,
+            "context": frames,
+            "tier": tier,
+            "trajectories": len(cases),
+            "repetitions": repetitions,
+            "device": device,
+            "threads": threads,
+            "torch": torch.__version__,
+            "models": [
+                asdict(p)
+                | {
+                    "ratios": asdict(r),
+                    "published_parameters": published_parameters(task.name, p.model, preset),
+                }
+                for p, r in compared
+            ],
+        },
+        table(
+            f"{task.title}, context {frames}, preset {preset}, {device}, {threads} thread(s): per trajectory",
+            ["", *(p.model for p in profiles)],
+            [
+                row("one at a time: context encoding [s]", lambda p, r: f"{p.single.encoding:.4f}"),
+                row("one at a time: simulation [s]", lambda p, r: f"{p.single.simulation:.4f}"),
+                row("one at a time: total [s]", lambda p, r: f"{p.single.total:.4f}"),
+                row(
+                    "    fastest .. slowest", lambda p, r: f"{p.single.fastest:.4f} .. {p.single.slowest:.4f}"
+                ),
+                row("    over M3GN's", lambda p, r: f"{r.single:.2f}"),
+                row("batched: trajectories at once", lambda p, r: str(p.batched.batch)),
+                row("batched: context encoding [s]", lambda p, r: f"{p.batched.encoding:.4f}"),
+                row("batched: simulation [s]", lambda p, r: f"{p.batched.simulation:.4f}"),
+                row("batched: total [s]", lambda p, r: f"{p.batched.total:.4f}"),
+                row(
+                    "    fastest .. slowest",
+                    lambda p, r: f"{p.batched.fastest:.4f} .. {p.batched.slowest:.4f}",
+                ),
+                row("    over M3GN's", lambda p, r: f"{r.batched:.2f}"),
+                row("operations [Gflop]", lambda p, r: f"{p.operations / 1e9:.2f}"),
+                row("    over M3GN's", lambda p, r: f"{r.operations:.2f}"),
+                row("peak memory of tensors [MB]", lambda p, r: f"{p.peak_memory / 1e6:.1f}"),
+                row("parameters", lambda p, r: str(p.parameters)),
+            ],
+        ),
+    )
 
 
 def _commit() -> str | None:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal, TypeVar
@@ -134,6 +135,7 @@ def model_names() -> list[str]:
     return sorted(entry.name for entry in entry_points(group=ENTRY_POINTS))
 
 
+@cache  # looking through all installed packages takes milliseconds
 def get_model_class(name: str) -> type[Model]:
     """The class of a registered model. Raises ConfigError listing all models if there is none."""
     for entry in entry_points(group=ENTRY_POINTS, name=name):
