@@ -19,8 +19,10 @@ Decisions where the paper and its parameter counts leave a choice:
   vectors, and reading them as scalars would break the equivariance that gives the model its name. With
   `invariant` (the default) their places hold zeros except for the vector's length, so that shapes and counts
   remain; otherwise they are read as they are. The sheet's load and the height above ground are scalars in both.
+- v is the last movement, in units of its standard deviation; positions are in units of the displacement's.
 - What enters as direction is then v, the vectors between nodes, and the collider's true path: its nodes are at
   their place at every time, and are not updated.
+- Nodes of prescribed position are put back in every layer, so that distances tell of them, too.
 - Squared distances are given as their difference to the anchor's, which is more precise and no less.
 - Messages and vectors are averaged: sums grow with the number of neighbours, and diverge with depth.
 - The velocity is scaled by the updated h, or the last layer's phi_h would do nothing.
@@ -99,6 +101,8 @@ class Scene:
     Attributes:
         graph: the anchor's.
         edge_features: shape [edges, features].
+        fixed: mesh nodes that never move, shape [nodes, 1, 1], bool.
+        anchor: positions of mesh nodes minus the body's mean, shape [nodes, 1, dim].
         collider: its positions minus the bodies' mean, shape [collider_nodes, times, dim].
         squared_distances: of every edge at the anchor, shape [edges, 1, 1].
         edge_length: typical length of a mesh edge, no shape.
@@ -106,6 +110,8 @@ class Scene:
 
     graph: Graph
     edge_features: Tensor
+    fixed: Tensor
+    anchor: Tensor
     collider: Tensor
     squared_distances: Tensor
     edge_length: Tensor
@@ -149,6 +155,7 @@ class EquivariantLayer(nn.Module):
         nodes = nodes + self.node_readout(functional.leaky_relu_(update)).view_as(nodes)
         mesh = len(position)
         position = position + velocity * self.velocity_scalar(nodes[:mesh]) + pulled[:mesh]
+        position = torch.where(scene.fixed, scene.anchor, position)
         return nodes, torch.stack([position, velocity], dim=-1).transpose(1, 2)
 
     def _exchange(self, nodes: Tensor, places: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
@@ -222,13 +229,15 @@ class EGNO(TrajectoryModel):
         position = (anchor - mean[body.body_of_node]) / self.displacement_scale
         velocity = (anchor - context.positions[-2]) / self.velocity_scale
         vectors = torch.stack([position, velocity], dim=-1)[:, :, None].expand(-1, -1, self.horizon, -1)
-        scene = self._scene(context, graph, mean, steps)
+        scene = self._scene(context, graph, position, mean, steps)
         for layer in self.layers:
             nodes, vectors = layer(nodes, vectors, scene)
         moved = vectors[..., 0].permute(2, 0, 1)[: context.horizon] - position
         return hold_fixed(context, anchor + moved * self.displacement_scale)
 
-    def _scene(self, context: Context, graph: Graph, mean: Tensor, steps: Tensor) -> Scene:
+    def _scene(
+        self, context: Context, graph: Graph, position: Tensor, mean: Tensor, steps: Tensor
+    ) -> Scene:
         body, path = context.body, context.collider_path
         true_path = path[steps.clamp(max=context.frames - 1)] - mean[body.body_of_collider_node]
         types, vector = self.task.edge_types, self.task.dimension + 1
@@ -238,6 +247,8 @@ class EGNO(TrajectoryModel):
         return Scene(
             graph=graph,
             edge_features=torch.cat([kinds, rest, world], dim=-1),
+            fixed=body.fixed[:, None, None],
+            anchor=position[:, None],
             collider=(true_path / self.displacement_scale).transpose(0, 1),
             squared_distances=(world[:, -1:, None] / self.displacement_scale).square(),
             edge_length=self.edge_length / self.displacement_scale,

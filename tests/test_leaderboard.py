@@ -113,7 +113,7 @@ def test_planted_error_in_weights_is_found(
     """A checkpoint that was replaced is not the recorded one, even if it is consistent in itself."""
     original = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=use_board)
     weights = load_file(original / "weights.safetensors")
-    weights["network.readout.bias"] += 1e-3
+    weights["simulator.network.readout.bias"] += 1e-3
     save_file(weights, tmp_path / "weights.safetensors")
     (tmp_path / "checkpoint.json").write_bytes((original / "checkpoint.json").read_bytes())
     monkeypatch.setattr(check, "checkpoint_folder", lambda *run: tmp_path)
@@ -122,10 +122,10 @@ def test_planted_error_in_weights_is_found(
 
 
 def test_planted_error_in_a_model_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from m3gn_bench.baselines.mgn import MeshGraphNet
+    from m3gn_bench.baselines.mgn import StepSimulator
 
-    original = MeshGraphNet._step
-    monkeypatch.setattr(MeshGraphNet, "_step", lambda self, *args: 1.1 * original(self, *args))
+    original = StepSimulator.forward
+    monkeypatch.setattr(StepSimulator, "forward", lambda self, *args: 1.1 * original(self, *args))
     report = run_check([r for r in read_records(use_board) if r.model == "mgn"])
     assert not report.ok
 
