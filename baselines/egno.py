@@ -235,9 +235,7 @@ class EGNO(TrajectoryModel):
         moved = vectors[..., 0].permute(2, 0, 1)[: context.horizon] - position
         return hold_fixed(context, anchor + moved * self.displacement_scale)
 
-    def _scene(
-        self, context: Context, graph: Graph, position: Tensor, mean: Tensor, steps: Tensor
-    ) -> Scene:
+    def _scene(self, context: Context, graph: Graph, position: Tensor, mean: Tensor, steps: Tensor) -> Scene:
         body, path = context.body, context.collider_path
         true_path = path[steps.clamp(max=context.frames - 1)] - mean[body.body_of_collider_node]
         types, vector = self.task.edge_types, self.task.dimension + 1

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import load_cases
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.model import build_model, load_preset
@@ -43,7 +44,7 @@ def main() -> None:
     parser.add_argument("--state", type=Path, default=None, help="a file to go on from after an interruption")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    use_cpu(options.threads)
 
     task = get_task(options.task)
     path = find_or_generate(task, options.tier, options.data, splits=("test",))

@@ -1,12 +1,10 @@
 """What each device of training brings, in steps per second and in error after the same time on one core.
 
-M3GN's compact preset is trained as it is, and with one thing changed at a time. Every run is appended to a file
-as it ends, and a run that the file has is not repeated; the table is made from the file.
+M3GN's compact preset is trained as it is, and with one thing changed at a time. The table is made from a file of
+results, see `results.py`.
 """
 
 import argparse
-import json
-import multiprocessing
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -15,6 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from results import Record, read_results, run_missing
 from rich.console import Console
 from usual_m3gn import PlainM3GN
 
@@ -61,11 +60,18 @@ def no_loss_scaling() -> AbstractContextManager[Any]:
     return patch.object(Model, "prepare", lambda self, cases: None)
 
 
+def memory_given_back() -> AbstractContextManager[Any]:
+    """The C library's defaults: large blocks go back to the system as soon as they are free."""
+    return patch.object(training, "use_cpu", torch.set_num_threads)
+
+
 # name in the table, what is overridden, what is exchanged in the code
 VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "as it is": ({}, None),
     "usual edge layer": ({}, usual_layers),
     "all context pairs": ({"model.training_context_pairs": None}, None),
+    "one context pair": ({"model.training_context_pairs": 1}, None),
+    "two context pairs": ({"model.training_context_pairs": 2}, None),
     "one trajectory per step": ({"training.batch_size": 1}, None),
     "four trajectories per step": ({"training.batch_size": 4}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
@@ -73,30 +79,30 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "no loss scaling": ({}, no_loss_scaling),
     "static parts rebuilt": ({}, rebuilt_static_parts),
     "optimiser not fused": ({}, plain_optimiser),
+    "memory given back": ({}, memory_given_back),
 }
 
 
-def run(task_name: str, variant: str, minutes: float, seed: int, data: Path) -> dict[str, Any]:
+def run(task: str, variant: str, minutes: float, seed: int, data: Path) -> Record:
     """Train one variant and score it on all validation trajectories."""
-    torch.set_num_threads(1)
-    task = get_task(task_name)
+    trained_on = get_task(task)
     overrides, exchange = VARIANTS[variant]
-    path = find_or_generate(task, "paper", data)
-    train_cases, validation_cases = (load_cases(path, task, split) for split in ("train", "validation"))
+    path = find_or_generate(trained_on, "paper", data)
+    train_cases, validation_cases = (
+        load_cases(path, trained_on, split, "paper") for split in ("train", "validation")
+    )
     settings = {"training.minutes": minutes, "training.validations": 4}
-    config = load_preset("m3gn", "compact", task, settings | overrides)
+    config = load_preset("m3gn", "compact", trained_on, settings | overrides)
     with ExitStack() as stack:
         if exchange is not None:
             stack.enter_context(exchange())
         out = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        done = training.train(config, task, train_cases, validation_cases, out, seed=seed, dataset_hash="")
+        done = training.train(
+            config, trained_on, train_cases, validation_cases, out, seed=seed, dataset_hash=""
+        )
         model, _ = checkpoint.load_checkpoint(out)
-        errors = evaluate_model(model, validation_cases, task.context_sizes)
+        errors = evaluate_model(model, validation_cases, trained_on.context_sizes)
     return {
-        "task": task_name,
-        "variant": variant,
-        "minutes": minutes,
-        "seed": seed,
         "steps": done.steps,
         "steps_per_second": done.steps / (60 * done.minutes),
         "validation_mse": {size: float(error.mse.mean()) for size, error in errors.items()},
@@ -114,31 +120,25 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("training_efficiency.jsonl"))
     options = parser.parse_args()
 
-    def recorded() -> list[dict[str, Any]]:
-        text = options.results.read_text() if options.results.is_file() else ""
-        return [json.loads(line) for line in text.splitlines()]
-
-    plan = [(task, name) for task in options.tasks.split(",") for name in options.variants.split(",")]
-    for task, variant in plan:
-        key = (task, variant, options.minutes, options.seed)
-        if any((r["task"], r["variant"], r["minutes"], r["seed"]) == key for r in recorded()):
-            continue
-        # A process of its own: nothing exchanged in the code survives, and memory starts afresh.
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            result = pool.apply(run, (*key, options.data))
-        with options.results.open("a") as file:
-            file.write(json.dumps(result) + "\n")
-    for task in options.tasks.split(","):
-        rows = [r for r in recorded() if (r["task"], r["minutes"]) == (task, options.minutes)]
+    tasks = options.tasks.split(",")
+    plan = [
+        {"task": task, "variant": variant, "minutes": options.minutes, "seed": options.seed}
+        for task in tasks
+        for variant in options.variants.split(",")
+    ]
+    run_missing(options.results, plan, run, data=options.data)
+    for task in tasks:
         sizes = get_task(task).context_sizes
         Console().print(
             table(
                 f"{task}, {options.minutes:g} minutes on one core",
-                ["variant", "seed", "steps/s", *(f"1e3 MSE at {size}" for size in sizes)],
+                ["variant", "seed", "steps/s", *(f"1e6 MSE at {size}" for size in sizes), "mean"],
                 [
-                    [r["variant"], str(r["seed"]), f"{r['steps_per_second']:.1f}"]
-                    + [f"{1e3 * r['validation_mse'][str(size)]:.3g}" for size in sizes]
-                    for r in rows
+                    [r["variant"], r["seed"], f"{r['steps_per_second']:.1f}"]
+                    + [f"{1e6 * mse:.3g}" for mse in r["validation_mse"].values()]
+                    + [f"{1e6 * sum(r['validation_mse'].values()) / len(sizes):.3g}"]
+                    for r in read_results(options.results)
+                    if (r["task"], r["minutes"]) == (task, options.minutes)
                 ],
             )
         )

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from usual_m3gn import PlainM3GN
 
+from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case, load_cases
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.model import build_model, load_preset
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--tier", default="smoke")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    use_cpu(options.threads)
 
     task = get_task(options.task)
     cases = load_cases(

@@ -581,9 +581,8 @@ def evaluate(
 
     Test trajectories are simulated first if they are not there yet.
     """
-    import torch
-
     from m3gn_bench.checkpoint import load_checkpoint, read_description
+    from m3gn_bench.cpu import use_cpu
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file, stored_hashes
     from m3gn_bench.datasets.schema import as_split
@@ -603,7 +602,7 @@ def evaluate(
     from m3gn_bench.tasks import TASKS, get_task
 
     report = Report(as_json)
-    torch.set_num_threads(threads)
+    use_cpu(threads)
     get_model_class(model)
     part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
@@ -777,6 +776,7 @@ def profile(
     """
     import torch
 
+    from m3gn_bench.cpu import use_cpu
     from m3gn_bench.data import load_cases
     from m3gn_bench.model import get_model_class
     from m3gn_bench.profiling import profile_models, ratios
@@ -786,7 +786,7 @@ def profile(
     from m3gn_bench.training import usable_device
 
     report = Report(as_json)
-    torch.set_num_threads(threads)
+    use_cpu(threads)
     task = get_task(task_name)
     for name in models:
         get_model_class(name)
@@ -957,13 +957,12 @@ def render(output: Path | None, check: bool, as_json: bool) -> None:
 @JSON
 def check_command(task_name: str | None, trajectories: int, offset: int | None, as_json: bool) -> None:
     """Re-derive numbers from nothing and compare with the records; exit code 1 where they differ."""
-    import torch
-
+    from m3gn_bench.cpu import use_cpu
     from m3gn_bench.leaderboard.check import RELATIVE_TOLERANCE, check_records
     from m3gn_bench.leaderboard.record import read_records
     from m3gn_bench.tasks import get_task
 
-    torch.set_num_threads(os.cpu_count() or 1)
+    use_cpu(os.cpu_count() or 1)
     if task_name is not None:
         get_task(task_name)
     records = [r for r in read_records() if task_name in (None, r.task)]

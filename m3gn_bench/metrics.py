@@ -4,6 +4,7 @@ All errors are mean squared errors per coordinate in scaled units, over the fram
 section 5: full-rollout MSE and per-timestep MSE).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,3 +68,24 @@ def confidence_interval(errors: np.ndarray) -> tuple[float, float]:
         rng=np.random.default_rng(0),
     ).confidence_interval
     return float(interval.low), float(interval.high)
+
+
+def bootstrap_means(errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Means over resampled seeds and trajectories, the same at every call.
+
+    Percentiles of a row are a model's interval. Trajectories are drawn for all models together and seeds for each
+    one, so that the difference of two rows is what one model's mean error may exceed the other's by.
+
+    Args:
+        errors: of each model, shape [seeds, trajectories]; all on the same trajectories.
+
+    Returns:
+        Shape [models, BOOTSTRAP_RESAMPLES].
+    """
+    rng = np.random.default_rng(0)
+
+    def shares(items: int) -> np.ndarray:
+        return rng.multinomial(items, np.full(items, 1 / items), BOOTSTRAP_RESAMPLES) / items
+
+    trajectories = shares(errors[0].shape[1])
+    return np.stack([((shares(len(e)) @ e) * trajectories).sum(1) for e in errors])

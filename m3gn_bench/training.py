@@ -26,6 +26,7 @@ from m3gn_bench.checkpoint import (
     read_description,
     save_checkpoint,
 )
+from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case, join
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
@@ -85,7 +86,7 @@ def train(
         CheckpointError: the folder holds a different run.
         TrainingError: the loss is no longer finite.
     """
-    torch.set_num_threads(threads)
+    use_cpu(threads)
     where = usable_device(device)
     model = build_model(config, task, seed)
     model.prepare(training_cases)

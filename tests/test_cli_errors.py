@@ -93,7 +93,10 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         ([*EVALUATE, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
         ([*EVALUATE, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
         ([*EVALUATE, "--preset", "big"], ["preset big", "--checkpoint"]),
-        (["leaderboard", "show", "--task", "bending"], ["task 'bending'", "known: deformable_block, falling_teddy,"]),
+        (
+            ["leaderboard", "show", "--task", "bending"],
+            ["task 'bending'", "known: deformable_block, falling_teddy,"],
+        ),
         (["simulate"], ["No such command 'simulate'"]),
         (["generate"], ["Missing argument 'SCENE'"]),
         (["info", "absent.h5"], ["no dataset file at absent.h5"]),

@@ -1,7 +1,8 @@
 """Every learned model can fit what it is shown: four trajectories, far better than standing still.
 
 Real trajectories of Deformable Block, the smallest networks, one fixed anchor: what is left is whether a model's
-own parts and its training loss work together. A context of five frames is past the transient after the change of material.
+own parts and its training loss work together. A context of five frames is past the transient after the change of
+material.
 """
 
 from dataclasses import replace
