@@ -31,15 +31,17 @@ class MessagePassingBlock(nn.Module):
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
         """Update nodes [nodes, width] and edges [edges, width]."""
-        return self.update(nodes, edges, self.edge_linear(edges), self.endpoint_linear(nodes), graph)
+        message = functional.linear(edges, self.edge_linear.weight)
+        return self.update(nodes, edges, message, self.endpoint_linear(nodes), graph)
 
     def update(
         self, nodes: Tensor, edges: Tensor, message: Tensor, endpoints: Tensor, graph: Graph
     ) -> tuple[Tensor, Tensor]:
-        """Update nodes and edges, given `edge_linear(edges)` (overwritten) and `endpoint_linear(nodes)`."""
+        """Update nodes and edges, given the products of W_e with edges (overwritten) and with nodes."""
         sender, receiver = endpoints.chunk(2, dim=-1)
-        # In place where autograd allows it: on a CPU this is bound by memory, not by arithmetic.
-        message += sender.index_select(0, graph.senders)
+        # In place where autograd allows it, and b_e added to nodes, of which there are fewer than edges: on a
+        # CPU this is bound by memory, not by arithmetic.
+        message += (sender + self.edge_linear.bias).index_select(0, graph.senders)
         message += receiver.index_select(0, graph.receivers)
         edges = self.edge_norm(edges + functional.leaky_relu_(message))
         summed = torch.zeros_like(nodes).index_add_(0, graph.receivers, edges)
@@ -77,8 +79,8 @@ class MessagePassingNetwork(nn.Module):
         nodes, edges = first.update(
             nodes,
             edges,
-            _compose(first.edge_linear, self.embed_edges, graph.edge_features),
-            _compose(first.endpoint_linear, self.embed_nodes, graph.node_features),
+            _compose(first.edge_linear.weight, self.embed_edges, graph.edge_features),
+            _compose(first.endpoint_linear.weight, self.embed_nodes, graph.node_features),
             graph,
         )
         for block in others:
@@ -86,7 +88,6 @@ class MessagePassingNetwork(nn.Module):
         return self.readout(functional.leaky_relu(self.hidden(nodes))).float()  # also under autocast
 
 
-def _compose(outer: nn.Linear, inner: nn.Linear, inputs: Tensor) -> Tensor:
-    """outer(inner(inputs)) as one layer: inputs are many and short, so a product with `outer` is saved."""
-    bias = functional.linear(inner.bias, outer.weight, outer.bias)
-    return functional.linear(inputs, outer.weight @ inner.weight, bias)
+def _compose(weight: Tensor, inner: nn.Linear, inputs: Tensor) -> Tensor:
+    """weight @ inner(inputs) as one layer: inputs are many and short, so a product with `weight` is saved."""
+    return functional.linear(inputs, weight @ inner.weight, weight @ inner.bias)

@@ -67,10 +67,11 @@ def operations_by_hand(model: Model, nodes: int, edges: int) -> int:
     width, blocks = network.hidden.out_features, len(network.blocks)  # type: ignore[union-attr, arg-type]
     node_input, edge_input = network.embed_nodes.in_features, network.embed_edges.in_features  # type: ignore[union-attr]
     outputs = network.readout.out_features  # type: ignore[union-attr]
-    # The first block's products with embeddings are taken on inputs, with products of two weights.
+    # The first block's products with embeddings are taken on inputs, with products of two weights. (Products with
+    # biases, of a matrix and a vector, are not counted.)
     per_edge = (blocks - 1) * width**2 + 2 * width * edge_input
     per_node = (4 * blocks - 2) * width**2 + 3 * width * node_input + width**2 + width * outputs
-    composed = width * width * (edge_input + 1) + 2 * width * width * (node_input + 1)
+    composed = width * width * edge_input + 2 * width * width * node_input
     return int(2 * (edges * per_edge + nodes * per_node + composed))
 
 
