@@ -6,8 +6,9 @@ results, see `results.py`.
 
 import argparse
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -19,6 +20,7 @@ from usual_m3gn import PlainM3GN
 
 from m3gn_bench import checkpoint, training
 from m3gn_bench.console import table
+from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Body, load_cases
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.m3gn import M3GN
@@ -47,14 +49,6 @@ def rebuilt_static_parts() -> AbstractContextManager[Any]:
     return patch.object(Body, "rest_vectors", property(Body.rest_vectors.func))
 
 
-def plain_optimiser() -> AbstractContextManager[Any]:
-    """AdamW tensor by tensor."""
-    adamw = torch.optim.AdamW
-    return patch.object(
-        torch.optim, "AdamW", lambda *given, **options: adamw(*given, **{**options, "fused": False})
-    )
-
-
 def no_loss_scaling() -> AbstractContextManager[Any]:
     """Losses and movements in scaled coordinates, not in units of the data's spread."""
     return patch.object(Model, "prepare", lambda self, cases: None)
@@ -78,9 +72,31 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "constant learning rate": ({"training.cosine_decay": False}, None),
     "no loss scaling": ({}, no_loss_scaling),
     "static parts rebuilt": ({}, rebuilt_static_parts),
-    "optimiser not fused": ({}, plain_optimiser),
     "memory given back": ({}, memory_given_back),
 }
+
+
+def rates(task_name: str, variants: list[str], steps: int, data: Path) -> list[tuple[str, float]]:
+    """Steps per second of variants that take turns, so that whatever else the machine does meets all of them."""
+    use_cpu(1)
+    task = get_task(task_name)
+    cases = load_cases(find_or_generate(task, "paper", data), task, "validation", "paper")
+    runs, seconds = {}, dict.fromkeys(variants, 0.0)
+    for name in variants:
+        overrides, exchange = VARIANTS[name]
+        config = load_preset("m3gn", "compact", task, {"training.steps": steps} | overrides)
+        with (exchange or nullcontext)():
+            model = training.build_model(config, task, 0)
+            model.prepare(cases)
+            runs[name] = training.Run(config, model, 0, Path(), {})
+            runs[name].step(cases)
+    for _ in range(steps):
+        for name, variant in runs.items():
+            with (VARIANTS[name][1] or nullcontext)():
+                start = time.process_time()
+                variant.step(cases)
+                seconds[name] += time.process_time() - start
+    return [(name, steps / seconds[name]) for name in variants]
 
 
 def run(task: str, variant: str, minutes: float, seed: int, data: Path) -> Record:
@@ -93,10 +109,8 @@ def run(task: str, variant: str, minutes: float, seed: int, data: Path) -> Recor
     )
     settings = {"training.minutes": minutes, "training.validations": 4}
     config = load_preset("m3gn", "compact", trained_on, settings | overrides)
-    with ExitStack() as stack:
-        if exchange is not None:
-            stack.enter_context(exchange())
-        out = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    with (exchange or nullcontext)(), tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
         done = training.train(
             config, trained_on, train_cases, validation_cases, out, seed=seed, dataset_hash=""
         )
@@ -115,16 +129,27 @@ def main() -> None:
     parser.add_argument("--tasks", default="sheet_deformation,deformable_block,falling_teddy")
     parser.add_argument("--variants", default=",".join(VARIANTS))
     parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument(
+        "--turns",
+        type=int,
+        default=None,
+        help="only measure speed, in so many steps of each variant in turns",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--results", type=Path, default=Path("training_efficiency.jsonl"))
     options = parser.parse_args()
 
-    tasks = options.tasks.split(",")
+    tasks, variants = options.tasks.split(","), options.variants.split(",")
+    if options.turns is not None:
+        for task in tasks:
+            rows = [[name, f"{r:.1f}"] for name, r in rates(task, variants, options.turns, options.data)]
+            Console().print(table(f"{task}, one core", ["variant", "steps/s"], rows))
+        return
     plan = [
         {"task": task, "variant": variant, "minutes": options.minutes, "seed": options.seed}
         for task in tasks
-        for variant in options.variants.split(",")
+        for variant in variants
     ]
     run_missing(options.results, plan, run, data=options.data)
     for task in tasks:

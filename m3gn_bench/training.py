@@ -9,7 +9,7 @@ checkpoint (see `checkpoint`) and no state.
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,7 +115,7 @@ def train(
         return read_description(out)
     require_budget(config, model.is_learned)
 
-    run = _Run(config, model, seed, out, describe)
+    run = Run(config, model, seed, out, describe)
     run.resume()
     cases = [case.to(where) for case in training_cases]
     held_out = [case.to(where) for case in validation_cases[: config.training.validation_trajectories]]
@@ -151,7 +151,23 @@ def usable_device(device: str) -> torch.device:
     return torch.device(device)
 
 
-class _Run:
+def as_one(parameters: Iterable[nn.Parameter]) -> nn.Parameter:
+    """One parameter that shares its memory, and its gradient's, with all of these.
+
+    Optimiser and gradient norm then take a few operations, not hundreds, which are a tenth of a small model's step.
+    """
+    parts = list(parameters)
+    sizes = [part.numel() for part in parts]
+    whole = nn.Parameter(torch.cat([part.detach().flatten() for part in parts]))
+    whole.grad = torch.zeros_like(whole)
+    for part, value, gradient in zip(
+        parts, whole.detach().split(sizes), whole.grad.split(sizes), strict=True
+    ):
+        part.data, part.grad = value.view_as(part), gradient.view_as(part)
+    return whole
+
+
+class Run:
     """The state of one run and its single steps."""
 
     def __init__(
@@ -163,11 +179,12 @@ class _Run:
         self.identity = identity
         self.progress = Progress()
         self.rng = np.random.default_rng(seed)
+        self.weights = as_one(model.parameters())
         self.optimizer = torch.optim.AdamW(
-            model.parameters(),
+            [self.weights],
             lr=self.training.learning_rate,
             weight_decay=self.training.weight_decay,
-            fused=True,  # one pass over all weights; otherwise a sixth of a small model's step
+            fused=True,
         )
         self.best_weights = {name: value.clone() for name, value in model.state_dict().items()}
 
@@ -176,7 +193,7 @@ class _Run:
         chosen = self.rng.choice(len(cases), min(self.training.batch_size, len(cases)), replace=False)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad(set_to_none=False)
         batch = join([cases[i] for i in chosen])
         with torch.autocast(
             batch.positions.device.type, torch.bfloat16, enabled=self.training.precision == "bfloat16"
@@ -184,7 +201,7 @@ class _Run:
             loss = self.model.training_loss(batch, self.rng)
         loss.backward()
         if self.training.gradient_clip is not None:
-            nn.utils.clip_grad_norm_(self.model.parameters(), self.training.gradient_clip)
+            nn.utils.clip_grad_norm_(self.weights, self.training.gradient_clip)
         self.optimizer.step()
         value = loss.item()
         if not math.isfinite(value):
