@@ -41,10 +41,11 @@ class MessagePassingBlock(nn.Module):
         sender, receiver = endpoints.chunk(2, dim=-1)
         # In place where autograd allows it, and b_e added to nodes, of which there are fewer than edges: on a
         # CPU this is bound by memory, not by arithmetic.
-        message += (sender + self.edge_linear.bias).index_select(0, graph.senders)
+        message += (sender + self.edge_linear.bias.to(sender.dtype)).index_select(0, graph.senders)
         message += receiver.index_select(0, graph.receivers)
         edges = self.edge_norm(edges + functional.leaky_relu_(message))
-        summed = torch.zeros_like(nodes).index_add_(0, graph.receivers, edges)
+        # Under autocast on CUDA, edges are float32 after the norm, and nodes need not be.
+        summed = edges.new_zeros(nodes.shape).index_add_(0, graph.receivers, edges)
         update = self.node_linear(nodes)
         update += self.message_linear(summed * graph.inverse_degree)
         return self.node_norm(nodes + functional.leaky_relu_(update)), edges

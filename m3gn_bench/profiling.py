@@ -108,12 +108,12 @@ def profile_models(
         ConfigError: unknown model or preset, or a context size that the trajectories do not allow.
     """
     where = device or torch.device("cpu")
-    cases = [case.to(where) for case in cases]
+    loaded, cases = cases, [case.to(where) for case in cases]
     ordered = dict.fromkeys([YARDSTICK, *names])
     timed: dict[str, TimedModel] = {}
     for name in ordered:
         model = build_model(load_preset(name, preset, task), task)
-        model.prepare(cases if model.is_learned else training_cases())
+        model.prepare(loaded if model.is_learned else training_cases())
         timed[name] = TimedModel(model.to(where).eval(), context)
     done, total = 0, 2 * len(timed) + repetitions
     costs, searched, chosen = {}, {}, {}
