@@ -94,7 +94,8 @@ class SpaceTimeBlock(nn.Module):
             change = self.edge_norm(functional.leaky_relu_(message))
             change += part.flatten(0, 1)
             updated.append(change.view_as(part))
-            summed.index_add_(0, receivers, updated[-1])
+            # Under autocast on CUDA, edges are float32 after the norm, and nodes need not be.
+            summed.index_add_(0, receivers, updated[-1].to(summed.dtype))
         update = self.node_linear(nodes.flatten(0, 1))
         update += self.message_linear((summed * graph.inverse_degree[:, None]).flatten(0, 1))
         update = self.node_norm(functional.leaky_relu_(update))

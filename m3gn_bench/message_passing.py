@@ -10,7 +10,6 @@ with the same number of parameters, and saves two of three matrix products per e
 with embedded edges and nodes are composed with the embeddings, which saves most of them.
 """
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
