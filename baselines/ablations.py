@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from m3gn_bench.baselines.mgn import MeshGraphNet, StepConfig, StepSimulator
+from m3gn_bench.baselines.spacetime import temporal_encoding
 from m3gn_bench.data import Body, Case, Context
 from m3gn_bench.m3gn import M3GN, ContextConfig, ContextEncoder, PrimitivesConfig, TrajectorySimulator
 from m3gn_bench.model import Model, TrajectoryModel
@@ -123,16 +124,6 @@ class SequenceTransformer(nn.Module):
         elements = self.shrink(sequences) + temporal_encoding(times, TRANSFORMER_SIZE)[:, None]
         question = self.question.expand(1, elements.shape[1], -1)
         return self.expand(self.blocks(torch.cat([question, elements]).transpose(0, 1))[:, 0])
-
-
-def temporal_encoding(times: Tensor, size: int) -> Tensor:
-    """Sines and cosines of frame indices at wavelengths from 2 pi to 20000 pi, shape [times, size].
-
-    Vaswani et al. 2017, section 3.5.
-    """
-    frequencies = 10000.0 ** -(torch.arange(0, size, 2, device=times.device) / size)
-    angles = times[:, None] * frequencies
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 class TransformerEncoder(ContextEncoder):

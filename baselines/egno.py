@@ -22,7 +22,7 @@ Decisions where the paper and its parameter counts leave a choice:
 - v is the last movement, in units of its standard deviation; positions are in units of the displacement's.
 - What enters as direction is then v, the vectors between nodes, and the collider's true path: its nodes are at
   their place at every time, and are not updated.
-- Nodes of prescribed position are put back in every layer, so that distances tell of them, too.
+- Nodes of prescribed position are put back before every exchange, so that distances tell of them, too.
 - Squared distances are given as their difference to the anchor's, which is more precise and no less.
 - Messages and vectors are averaged: sums grow with the number of neighbours, and diverge with depth.
 - The velocity is scaled by the updated h, or the last layer's phi_h would do nothing.
@@ -148,6 +148,7 @@ class EquivariantLayer(nn.Module):
         nodes = nodes + functional.leaky_relu(self.convolution(nodes))
         vectors = vectors + self.vector_convolution(vectors.flatten(0, 1)).view_as(vectors)
         position, velocity = vectors.transpose(1, 2).unbind(-1)
+        position = torch.where(scene.fixed, scene.anchor, position)
 
         received, pulled = self._exchange(nodes, torch.cat([position, scene.collider]), scene)
         update = self.node_linear(nodes.flatten(0, 1))
@@ -155,7 +156,6 @@ class EquivariantLayer(nn.Module):
         nodes = nodes + self.node_readout(functional.leaky_relu_(update)).view_as(nodes)
         mesh = len(position)
         position = position + velocity * self.velocity_scalar(nodes[:mesh]) + pulled[:mesh]
-        position = torch.where(scene.fixed, scene.anchor, position)
         return nodes, torch.stack([position, velocity], dim=-1).transpose(1, 2)
 
     def _exchange(self, nodes: Tensor, places: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:

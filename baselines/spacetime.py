@@ -21,20 +21,28 @@ def edges_at_a_time(graph: Graph, times: int, width: int) -> int:
     return max(1, CACHED // (times * width))
 
 
-def time_embedding(frames: Tensor, anchor: int) -> Tensor:
-    """Sines and cosines of each frame's number and of its distance from the anchor, shape [times, 32].
+def temporal_encoding(numbers: Tensor, size: int) -> Tensor:
+    """Sines and cosines of numbers at wavelengths from 2 pi to 20000 pi, shape [numbers, size].
 
-    The wavelengths are those of Vaswani et al. 2017. The published counts fix the length only. One half each
-    for both numbers, because loads follow the first and what is predicted vanishes where the second is zero.
+    Vaswani et al. 2017, section 3.5.
+    """
+    frequencies = 10_000.0 ** -(torch.arange(0, size, 2, device=numbers.device) / size)
+    angles = numbers[:, None] * frequencies
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def time_embedding(frames: Tensor, anchor: int) -> Tensor:
+    """Encodes each frame's number and its distance from the anchor, shape [times, 32].
+
+    The published counts fix the length only. One half each for both numbers, because loads follow the first and
+    what is predicted vanishes where the second is zero.
 
     Args:
         frames: numbers of frames, shape [times], int.
         anchor: number of the anchor's frame.
     """
-    waves = TIME_FEATURES // 4
-    frequencies = 10_000.0 ** (-torch.arange(waves, device=frames.device) / waves)
-    angles = torch.cat([frames[:, None] * frequencies, (frames - anchor)[:, None] * frequencies], dim=-1)
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+    half = TIME_FEATURES // 2
+    return torch.cat([temporal_encoding(frames, half), temporal_encoding(frames - anchor, half)], dim=-1)
 
 
 class SpaceTimeLinear(nn.Module):

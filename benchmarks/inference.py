@@ -89,6 +89,8 @@ def main() -> None:
         }
         keep()
     batches = record["batches"]
+    for name, model in timed.items():  # the first run is a slow one, also after an interruption
+        model.run(cases[: batches[name]], batches[name])
     turn = math.lcm(*batches.values())  # trajectories of one turn
     for first in range(turn * len(record["seconds"][options.models[0]]), len(cases), turn):
         part = cases[first : first + turn]

@@ -49,8 +49,8 @@ def rebuilt_static_parts() -> AbstractContextManager[Any]:
     return patch.object(Body, "rest_vectors", property(Body.rest_vectors.func))
 
 
-def no_loss_scaling() -> AbstractContextManager[Any]:
-    """Losses and movements in scaled coordinates, not in units of the data's spread."""
+def no_scaling() -> AbstractContextManager[Any]:
+    """Loss, movements and what is predicted in scaled coordinates, not in units of the data's spread."""
     return patch.object(Model, "prepare", lambda self, cases: None)
 
 
@@ -61,16 +61,16 @@ def memory_given_back() -> AbstractContextManager[Any]:
 
 # name in the table, what is overridden, what is exchanged in the code
 VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
-    "as it is": ({}, None),
+    "as it is": ({}, None),  # two context pairs, one trajectory per step
     "usual edge layer": ({}, usual_layers),
     "all context pairs": ({"model.training_context_pairs": None}, None),
     "one context pair": ({"model.training_context_pairs": 1}, None),
-    "two context pairs": ({"model.training_context_pairs": 2}, None),
-    "one trajectory per step": ({"training.batch_size": 1}, None),
     "four trajectories per step": ({"training.batch_size": 4}, None),
+    "four, all context pairs": ({"training.batch_size": 4, "model.training_context_pairs": None}, None),
+    "four, one context pair": ({"training.batch_size": 4, "model.training_context_pairs": 1}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
     "constant learning rate": ({"training.cosine_decay": False}, None),
-    "no loss scaling": ({}, no_loss_scaling),
+    "no scaling by the data's spread": ({}, no_scaling),
     "static parts rebuilt": ({}, rebuilt_static_parts),
     "memory given back": ({}, memory_given_back),
 }

@@ -26,7 +26,7 @@ class Body:
     model handles a batch of trajectories without knowing it. Where there is no collider, it has no nodes.
 
     Attributes:
-        rest_positions: scaled, shape [nodes, dim].
+        rest_positions: the first frame, which models take for the body at rest; scaled, shape [nodes, dim].
         edges: sender and receiver of each directed mesh edge, sorted by receiver, shape [2, edges].
         static_features: shape [nodes, static].
         fixed: nodes that never move, shape [nodes], bool.

@@ -114,7 +114,7 @@ class ContextEncoder(nn.Module):
         return latents.amax(0)
 
     def _observed(self, context: Context) -> Tensor:
-        """The context's frames, noisy if so configured, by the same noise whenever a body is seen again."""
+        """The context's frames, noisy if so configured, by the same noise whenever the same context is seen again."""
         if not self.config.context_noise:
             return context.positions
         parts = []

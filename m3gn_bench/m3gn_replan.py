@@ -4,7 +4,8 @@ The paper names the limit (section 6): smooth primitives over the whole horizon 
 without looking again. Here the task description z is inferred once, from the context; then the simulator
 predicts `segment` frames, looks at the graph that it predicted (with new contacts), and goes on from there.
 Every segment starts at the last predicted position with the velocity of the last predicted frames, which a
-primitive keeps exactly, as M3GN does at the anchor. One segment as long as the horizon is M3GN.
+primitive keeps exactly, as M3GN does at the anchor. One segment as long as the horizon is M3GN, but
+for the units of time and of displacements.
 """
 
 from collections.abc import Sequence
@@ -56,7 +57,7 @@ class M3GNReplan(M3GN):
     def prepare(self, cases: Sequence[Case]) -> None:
         """As every model, but displacements are those within a segment."""
         super().prepare(cases)
-        length = self.config.segment
+        length = min(self.config.segment, self.task.frames - 1)
         moved = [
             (c.positions[length:] - c.positions[:-length])[:, ~c.body.fixed].numpy().ravel() for c in cases
         ]

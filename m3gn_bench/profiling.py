@@ -10,7 +10,7 @@ The quantities of the paper's table "Runtime, memory, and parameter comparison" 
 - Operations are those of matrix products and convolutions, two for each multiplication and addition. Their
   ratio bounds what a model can gain in time where arithmetic takes all of it.
 
-Weights are untrained. Time hardly depends on them: only a step-wise model's contact edges do, where its mesh goes.
+Weights are untrained. Time hardly depends on them: only contact edges do, where a model's own predictions go back in.
 """
 
 import os

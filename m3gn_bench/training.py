@@ -2,7 +2,7 @@
 
 The whole state (weights, optimiser, best weights so far, random generator, counters) is one safetensors
 file in the output folder, replaced atomically. A run that is killed and started again goes on from it; with
-a budget in steps it ends with exactly the weights of a run that was never killed. Finished runs leave a
+a budget in steps it ends, on a CPU, with exactly the weights of a run that was never killed. Finished runs leave a
 checkpoint (see `checkpoint`) and no state.
 """
 

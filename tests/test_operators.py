@@ -95,8 +95,8 @@ def test_time_embedding_tells_the_frame_and_its_distance_from_the_anchor() -> No
     assert found.shape == (56, TIME_FEATURES)
     for row, frame in ((0, 4), (6, 10), (50, 54)):
         waves = [10_000.0 ** (-i / 8) for i in range(8)]
-        angles = np.array([n * wave for n in (frame, frame - 10) for wave in waves])
-        expected = np.concatenate([np.sin(angles), np.cos(angles)])
+        angles = [n * np.array(waves) for n in (frame, frame - 10)]
+        expected = np.concatenate([part(angle) for angle in angles for part in (np.sin, np.cos)])
         assert np.abs(found[row].numpy() - expected).max() < 1e-5
 
 

@@ -16,13 +16,14 @@ from m3gn_bench.data import Case, load_cases
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.generators.generate import generate
 from m3gn_bench.generators.scene import get_scene
-from m3gn_bench.model import build_model, load_preset, model_names
+from m3gn_bench.model import build_model, get_model_class, load_preset, model_names
 from m3gn_bench.tasks import get_task
 from m3gn_bench.training import train
 
 CONTEXT = 5
 TASK = replace(get_task("deformable_block"), training_context=(CONTEXT, CONTEXT), context_sizes=(CONTEXT,))
-LEARNED = [n for n in model_names() if build_model(load_preset(n, "smoke", TASK), TASK).is_learned]
+OURS = [n for n in model_names() if get_model_class(n).__module__.startswith("m3gn_bench.")]
+LEARNED = [n for n in OURS if build_model(load_preset(n, "smoke", TASK), TASK).is_learned]
 
 # Steps of the whole batch, learning rate, and hyper-parameters where the preset "smoke" has others.
 WITH_PRIMITIVES = 400, 5e-3, {"initial_tau": 0.5}
