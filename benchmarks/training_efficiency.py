@@ -66,8 +66,8 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "all context pairs": ({"model.training_context_pairs": None}, None),
     "one context pair": ({"model.training_context_pairs": 1}, None),
     "four trajectories per step": ({"training.batch_size": 4}, None),
-    "four, all context pairs": ({"training.batch_size": 4, "model.training_context_pairs": None}, None),
-    "four, one context pair": ({"training.batch_size": 4, "model.training_context_pairs": 1}, None),
+    "four and all pairs": ({"training.batch_size": 4, "model.training_context_pairs": None}, None),
+    "four and one pair": ({"training.batch_size": 4, "model.training_context_pairs": 1}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
     "constant learning rate": ({"training.cosine_decay": False}, None),
     "no scaling by the data's spread": ({}, no_scaling),
@@ -141,6 +141,8 @@ def main() -> None:
     options = parser.parse_args()
 
     tasks, variants = options.tasks.split(","), options.variants.split(",")
+    if unknown := set(variants) - set(VARIANTS):
+        parser.error(f"unknown variants {sorted(unknown)}; known: {', '.join(VARIANTS)}")
     if options.turns is not None:
         for task in tasks:
             rows = [[name, f"{r:.1f}"] for name, r in rates(task, variants, options.turns, options.data)]
