@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -144,7 +144,9 @@ class Case:
     def to(self, device: torch.device) -> "Case":
         """The same case on another device."""
         values = {field.name: getattr(self.body, field.name) for field in fields(Body)}
-        moved = {name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)}
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+        }
         body = replace(self.body, **moved)
         return Case(body, self.positions.to(device), self.collider_path.to(device), self.keys)
 

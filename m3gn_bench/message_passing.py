@@ -10,6 +10,9 @@ with the same number of parameters, and saves two of three matrix products per e
 with embedded edges and nodes are composed with the embeddings, which saves most of them.
 """
 
+from collections.abc import Iterable
+from typing import cast
+
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -75,7 +78,7 @@ class MessagePassingNetwork(nn.Module):
         """Outputs per node, shape [nodes, outputs]."""
         nodes = self.embed_nodes(graph.node_features)
         edges = self.embed_edges(graph.edge_features)
-        first, *others = self.blocks
+        first, *others = cast(Iterable[MessagePassingBlock], self.blocks)
         nodes, edges = first.update(
             nodes,
             edges,

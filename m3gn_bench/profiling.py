@@ -112,9 +112,9 @@ def profile_models(
     ordered = dict.fromkeys([YARDSTICK, *names])
     timed: dict[str, TimedModel] = {}
     for name in ordered:
-        model = build_model(load_preset(name, preset, task), task)
-        model.prepare(loaded if model.is_learned else training_cases())
-        timed[name] = TimedModel(model.to(where).eval(), context)
+        built = build_model(load_preset(name, preset, task), task)
+        built.prepare(loaded if built.is_learned else training_cases())
+        timed[name] = TimedModel(built.to(where).eval(), context)
     done, total = 0, 2 * len(timed) + repetitions
     costs, searched, chosen = {}, {}, {}
     for name, model in timed.items():
@@ -220,7 +220,7 @@ class TimedModel:
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or it writes to standard error that it starts
         with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
             self.predict(case)
-        events = recorded.profiler.kineto_results.events()  # type: ignore[union-attr]
+        events = recorded.profiler.kineto_results.events()
         changes = sorted((e.start_ns(), e.nbytes()) for e in events if e.name() == "[memory]")
         return held + max(accumulate(size for _, size in changes), default=0)
 
