@@ -10,17 +10,17 @@ jump. Source: paper, sections 5 and C; sizes, ratios and numbers follow the desc
 
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import ElementQuadS2, MeshQuad
+from skfem import ElementQuad1, ElementQuad2, ElementQuadS2, ElementTriP1, MeshQuad, MeshTri
 
 from m3gn_bench.datasets.errors import unknown_name
-from m3gn_bench.datasets.schema import Fidelity, Split
+from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.errors import GeneratorError
-from m3gn_bench.generators.scene import SimulatedWithScikitFem, SingleTask
+from m3gn_bench.generators.errors import GeneratorError, problem
+from m3gn_bench.generators.scene import Leveled, SimulatedWithScikitFem, SingleTask
 from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Solid
@@ -55,13 +55,14 @@ COLLIDER_NODES = 57
 PENALTY_RATIO = 10.0  # of Young's modulus [1/mm]: a pressure E/20 sinks in by 5 µm
 FACET_ORDER = 5  # three Gauss points per facet
 SAMPLING_ORDER = 31  # sixteen points per facet, to see what happens between those three
-CELL_ORDER = 3  # 2 x 2 Gauss points per cell: with eight nodes this neither locks nor hourglasses
+CELL_ORDER = 3  # 2 x 2 Gauss points per cell
 
 MAX_PENETRATION = 0.1  # of the radius
 MAX_FORCE_DROP = 0.5  # of the largest contact force so far
 MAX_STEP = 4.0  # of a node, in steps of the circle
 TRANSIENT = 2  # transitions in which the block finds its new equilibrium after the change of material
 MAX_TRANSIENT_STEP = 0.1 * HEIGHT  # [mm], of a node in those
+REMEDY = "press less deep, more slowly, with a larger circle or further from the block's corners"
 
 Plane = Literal["stress", "strain"]
 
@@ -87,20 +88,32 @@ class BlockParameters:
     speed: float = SPEED
 
 
+# Mesh, element and integration order of the cells. "serendipity", with 2 x 2 Gauss points, neither locks nor
+# hourglasses; the others are there to be compared.
+ELEMENTS: dict[str, tuple[Any, Any, int]] = {
+    "serendipity": (MeshQuad, ElementQuadS2(), CELL_ORDER),
+    "biquadratic": (MeshQuad, ElementQuad2(), 5),
+    "bilinear": (MeshQuad, ElementQuad1(), CELL_ORDER),
+    "linear triangles": (MeshTri, ElementTriP1(), 1),
+}
+
+
 @dataclass(frozen=True)
 class BlockFidelity:
     """Discretisation: cells per side (a multiple of eight), time steps in each hidden frame, in the frames
-    that follow the change of material, and in all others, and Newton's tolerance relative to the reaction."""
+    that follow the change of material, and in all others, Newton's tolerance relative to the reaction, and the
+    element, one of `ELEMENTS`."""
 
     cells: int
     hidden_steps: int
     transient_steps: tuple[int, ...]
     steps: int
     tolerance: float
+    element: str = "serendipity"
 
 
 @dataclass(frozen=True)
-class DeformableBlock(SingleTask, SimulatedWithScikitFem):
+class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
     """The scene. Positions in mm, Young's modulus in Pa, time in s.
 
     Attributes:
@@ -150,35 +163,37 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
             start=float(rng.uniform(-reach, reach)),
         )
 
-    def simulate(self, parameters: BlockParameters, fidelity: Fidelity = "default") -> Trajectory:
-        """Simulate 49 steps of a frame each; record the state after the eleventh and what follows.
+    def simulate_with(
+        self, parameters: BlockParameters, level: BlockFidelity, frames: int | None = None
+    ) -> Trajectory:
+        """Simulate eleven hidden frames, of which the state after the last is recorded, and those that follow.
 
         Raises:
             SolverError: a time step has no solution.
         """
-        level = self.fidelities[fidelity]
-        block = make_block(parameters.widths, level.cells)
+        frames = self.frames if frames is None else frames
+        block = make_block(parameters.widths, level.cells, level.element)
         dynamics, disc = self.prepare(parameters, block.body, block.contact_points, level.tolerance)
         first, second = parameters.poisson_ratios
-        states = np.empty((RECORDED_FRAMES, block.body.solid.dofs))
-        forces = np.empty(RECORDED_FRAMES)
+        states = np.empty((frames, block.body.solid.dofs))
+        forces = np.empty(frames)
         for k in range(1, HIDDEN_FRAMES + 1):
             label = f"frame {k - HIDDEN_FRAMES} (frame 0 is the first recorded)"
             dynamics.advance(FRAME * k, level.hidden_steps, label)
         states[0], forces[0] = dynamics.displacement, dynamics.contact_forces[0, 1]
         dynamics.potential.law = self.law(parameters.youngs_modulus, second)
         dynamics.restart()
-        for k in range(1, RECORDED_FRAMES):
+        for k in range(1, frames):
             steps = level.transient_steps[k - 1] if k <= len(level.transient_steps) else level.steps
-            dynamics.advance(FRAME * (HIDDEN_FRAMES + k), steps, f"frame {k} of {RECORDED_FRAMES}")
+            dynamics.advance(FRAME * (HIDDEN_FRAMES + k), steps, f"frame {k} of {frames - 1}")
             states[k], forces[k] = dynamics.displacement, dynamics.contact_forces[0, 1]
 
-        displacements = states.reshape(RECORDED_FRAMES, -1, 2)[:, block.recorded]
+        displacements = states.reshape(frames, -1, 2)[:, block.recorded]
         positions = block.mesh.rest_positions.astype(np.float64) + displacements
         around = np.arange(COLLIDER_NODES)
         angles = -np.pi / 2 + 2 * np.pi * around / COLLIDER_NODES
         ring = parameters.radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        centres = np.array([disc.centre(FRAME * (HIDDEN_FRAMES + k)) for k in range(RECORDED_FRAMES)])
+        centres = np.array([disc.centre(FRAME * (HIDDEN_FRAMES + k)) for k in range(frames)])
         depth = [
             disc.depth(points.reshape(-1, 2), FRAME * (HIDDEN_FRAMES + k)).max()
             for k, points in enumerate(block.surface_points.positions(states))
@@ -242,29 +257,43 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
     def check(self, trajectory: Trajectory) -> list[str]:
         """Finite, clamped, no triangle turned over, no punch-through, little penetration, no jump."""
         positions = trajectory.positions.astype(np.float64)
-        if not np.isfinite(positions).all():
-            return ["positions are not finite"]
+        finite = np.isfinite(positions).all((1, 2))
+        if not finite.all():
+            return [problem(int(finite.argmin()), "positions are not finite", REMEDY)]
         problems = []
         fixed = trajectory.mesh.node_type == FIXED
-        if np.abs(positions[:, fixed] - trajectory.mesh.rest_positions[fixed]).max() > 0:
-            problems.append("a clamped node moves")
+        moved = np.abs(positions[:, fixed] - trajectory.mesh.rest_positions[fixed]).max((1, 2))
+        if moved.any():
+            problems.append(
+                problem(int(moved.argmax()), f"a clamped node moves by {moved.max():.2g} mm", "clamp it")
+            )
         corners = positions[:, trajectory.mesh.cells]
         a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
-        areas = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        areas = (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]).min(1) / 2
         if areas.min() <= 0:
-            problems.append(f"a triangle turns over in frame {np.flatnonzero(areas.min(1) <= 0)[0]}")
+            frame = int(np.flatnonzero(areas <= 0)[0])
+            problems.append(
+                problem(frame, f"a triangle turns over, its area is {areas[frame]:.2g} mm²", REMEDY)
+            )
         radius = float(trajectory.loads["radius"][0])
         found = trajectory.diagnostics
-        depth, frame = found["max_penetration"], found["max_penetration_frame"]
+        depth = found["max_penetration"]
         if depth > MAX_PENETRATION * radius:
             problems.append(
-                f"the circle of radius {radius:.1f} mm sinks in by {depth:.2f} mm in frame {frame:.0f}"
+                problem(
+                    int(found["max_penetration_frame"]),
+                    f"the circle of radius {radius:.1f} mm sinks in by {depth:.2f} mm",
+                    REMEDY,
+                )
             )
-        drop, frame = found["max_force_drop"], found["max_force_drop_frame"]
+        drop = found["max_force_drop"]
         if drop > MAX_FORCE_DROP:
             problems.append(
-                f"the contact force has fallen by {drop:.0%} in frame {frame:.0f}: the circle punches through "
-                "or slips off"
+                problem(
+                    int(found["max_force_drop_frame"]),
+                    f"the contact force has fallen by {drop:.0%}: the circle punches through or slips off",
+                    REMEDY,
+                )
             )
         assert trajectory.collider_positions is not None
         collider = trajectory.collider_positions.astype(np.float64)
@@ -273,7 +302,7 @@ class DeformableBlock(SingleTask, SimulatedWithScikitFem):
         allowed = np.where(np.arange(len(steps)) < TRANSIENT, MAX_TRANSIENT_STEP, MAX_STEP * travel)
         jumps = np.flatnonzero(steps > allowed)
         if jumps.size:
-            problems.append(f"a node jumps by {steps[jumps[0]]:.2f} mm in frame {jumps[0] + 1}")
+            problems.append(problem(int(jumps[0]) + 1, f"a node jumps by {steps[jumps[0]]:.2f} mm", REMEDY))
         return problems
 
     def extreme_materials(self, parameters: BlockParameters) -> tuple[BlockParameters, BlockParameters]:
@@ -319,12 +348,13 @@ class Block:
 
 
 @lru_cache(maxsize=2 * len(TRAPEZOIDS))
-def make_block(widths: tuple[float, float], cells: int) -> Block:
+def make_block(widths: tuple[float, float], cells: int, element: str = "serendipity") -> Block:
     """The trapezoid with these widths of base and top, with so many cells (a multiple of eight) per side."""
+    mesh_class, shape_functions, integration_order = ELEMENTS[element]
     grid = np.linspace(0, 1, cells + 1)
-    square = MeshQuad.init_tensor(grid, grid)
-    mesh = MeshQuad(_trapezoid(widths, square.p.T).T, square.t)
-    solid = Solid(mesh, ElementQuadS2(), integration_order=CELL_ORDER)
+    square = mesh_class.init_tensor(grid, grid)
+    mesh = mesh_class(_trapezoid(widths, square.p.T).T, square.t)
+    solid = Solid(mesh, shape_functions, integration_order=integration_order)
     base = np.flatnonzero(solid.nodes[:, 1] < BASE + 1e-9 * HEIGHT)
     facets = mesh.boundary_facets()
     heights = mesh.p[1, mesh.facets[:, facets]].mean(0)

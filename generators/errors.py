@@ -13,6 +13,11 @@ class SolverError(BenchError):
     """A solver did not reach equilibrium. The draw is rejected and counted, never kept."""
 
 
+def problem(frame: int, what: str, remedy: str) -> str:
+    """What is wrong with a trajectory, from which frame on, and what to do about it, in one line."""
+    return f"frame {frame}: {what}; {remedy}"
+
+
 def require_installed(library: str, purpose: str, extra: str) -> None:
     """Raises GeneratorError, naming the extra to install, where an optional library is missing."""
     if importlib.util.find_spec(library) is None:

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.datasets.errors import unknown_name
-from m3gn_bench.datasets.schema import Fidelity, Split
+from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.errors import GeneratorError, SolverError, require_installed
+from m3gn_bench.generators.errors import GeneratorError, SolverError, problem, require_installed
 from m3gn_bench.generators.objects import SoftBody, load_object
-from m3gn_bench.generators.scene import SingleTask
+from m3gn_bench.generators.scene import Leveled, SingleTask
 from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
 
 if TYPE_CHECKING:  # it loads Warp
@@ -36,6 +36,7 @@ FRAME_TIME = 0.01  # [s]
 YOUNGS_MODULI = np.linspace(1e5, 1e6, 1000)  # [Pa]
 POISSON_RATIOS = np.linspace(0.0, 0.499, 100)
 MAX_ENERGY_GROWTH = 1e-2  # within a frame, of the energy at the start
+REMEDY = "use a stiffer material, drop it from less high, or use more substeps"
 FLAT = 1e-12  # volume of a cell over the cube of its size
 MAX_HALVINGS = 3  # of the step, where a motion diverges
 MAX_FLIGHT_ERROR = 1e-6  # [m]
@@ -65,16 +66,19 @@ class FallFidelity:
         courant: the explicit solver's step in units of its limit of stability at rest.
         vbd_iterations: sweeps of vertex block descent per substep.
         vbd_substeps: its substeps per frame.
+        nodal_pressure: average the volume ratio over nodes (the explicit solver only); plain linear tetrahedra
+            lock as nu approaches 0.5.
     """
 
     refinements: int
     courant: float
     vbd_iterations: int
     vbd_substeps: int
+    nodal_pressure: bool = True
 
 
 @dataclass(frozen=True)
-class _FallingObjects(SingleTask):
+class _FallingObjects(Leveled, SingleTask):
     """What the two scenes share. Positions in m; the floor is z = 0."""
 
     solver: Solver = "explicit"
@@ -127,13 +131,16 @@ class _FallingObjects(SingleTask):
         """The object of that name, its largest extent 1."""
         return load_object(name)
 
-    def simulate(self, parameters: FallParameters, fidelity: Fidelity = "default") -> Trajectory:
-        """States at 0, 0.01, ..., 2 s.
+    def simulate_with(
+        self, parameters: FallParameters, level: FallFidelity, frames: int | None = None
+    ) -> Trajectory:
+        """States at 0, 0.01, 0.02, ... s, 201 of them if not told otherwise.
 
         Raises:
             SolverError: positions are not finite even with steps of an eighth.
+            ValueError: a parameter is out of its physical range, or the floor is not reached in so many frames.
         """
-        level = self.fidelities[fidelity]
+        frames = self.frames if frames is None else frames
         body = self.body(parameters.object)
         recorded, surface = body.surface_nodes, body.surface
         for _ in range(level.refinements):
@@ -145,6 +152,8 @@ class _FallingObjects(SingleTask):
         # Until it touches the floor the body is free of stress, and its motion known.
         down = np.array([0.0, 0.0, -GRAVITY])
         times = _flight_times(parameters.height)
+        if frames <= len(times):
+            raise ValueError(f"frames must be more than the {len(times)} of the free fall, not {frames}")
         flight = start[:recorded] + down / 2 * times[:, None, None] ** 2
         solid, substeps = self._solid(start, body.tetrahedra, parameters, level)
         for halving in range(MAX_HALVINGS + 1):
@@ -153,7 +162,7 @@ class _FallingObjects(SingleTask):
                     start + down / 2 * times[-1] ** 2,
                     np.tile(down * times[-1], (len(start), 1)),
                     first_frame=len(times) - 1,
-                    frames=TRANSITIONS + 1 - len(times),
+                    frames=frames - len(times),
                     frame_time=FRAME_TIME,
                     substeps=substeps,
                 )
@@ -167,6 +176,7 @@ class _FallingObjects(SingleTask):
 
         energies, ratios = solid.monitor(motion)
         total = energies.sum(1)
+        growth, speeds = np.diff(total), np.linalg.norm(motion.velocities, axis=-1).max(1)
         inverted = (ratios <= 0).sum(1)
         return Trajectory(
             positions=positions.astype(np.float32),
@@ -192,34 +202,45 @@ class _FallingObjects(SingleTask):
                 "inverted_tetrahedra": int(inverted.max()),
                 "inverted_tetrahedra_at_end": int(inverted[-1]),
                 "self_penetrating_nodes_at_end": _self_penetrating(motion.positions[-1], solid, recorded),
-                "energy_growth": float(np.diff(total).max() / total[0]),
+                "energy_growth": float(growth.max() / total[0]),
+                "energy_growth_frame": len(times) + int(growth.argmax()),
                 "energy_left": float(total[-1] / total[0]),
-                "max_speed": float(np.linalg.norm(motion.velocities, axis=-1).max()),
+                "max_speed": float(speeds.max()),
+                "max_speed_frame": len(times) - 1 + int(speeds.argmax()),
             },
         )
 
     def check(self, trajectory: Trajectory) -> list[str]:
         """Finite, falling freely at first, above the floor, no energy from nowhere, nothing left inverted."""
         positions = trajectory.positions.astype(np.float64)
-        if not np.isfinite(positions).all():
-            frame = int(np.flatnonzero(~np.isfinite(positions).all((1, 2)))[0])
-            return [f"positions are not finite from frame {frame}"]
+        finite = np.isfinite(positions).all((1, 2))
+        if not finite.all():
+            return [problem(int(finite.argmin()), "positions are not finite", "use more substeps")]
         problems = []
         height = float(trajectory.loads["height"])
         times = _flight_times(height)
         flight = positions[0] - np.array([0.0, 0.0, GRAVITY / 2]) * times[:, None, None] ** 2
-        if not np.abs(positions[: len(times)] - flight).max() < MAX_FLIGHT_ERROR:
-            problems.append("it does not fall freely before it touches the floor")
+        astray = np.abs(positions[: len(times)] - flight).max((1, 2))
+        if not astray.max() < MAX_FLIGHT_ERROR:
+            what = f"it does not fall freely before it touches the floor, but is {astray.max():.2g} m off"
+            problems.append(
+                problem(int(astray.argmax()), what, "start it at rest, its lowest point at the height")
+            )
         lowest = positions[:, :, 2].min(1)
         if lowest.min() < -MAX_PENETRATION:
-            problems.append(f"a node is {-lowest.min():.2g} m below the floor in frame {lowest.argmin()}")
+            what = f"a node is {-lowest.min():.2g} m below the floor"
+            problems.append(problem(int(lowest.argmin()), what, "use more substeps"))
         found = trajectory.diagnostics
         if not found["energy_growth"] <= MAX_ENERGY_GROWTH:
-            problems.append(f"the energy grows by {found['energy_growth']:.2%} within a frame")
+            what = f"the energy grows by {found['energy_growth']:.2%} within a frame"
+            problems.append(problem(int(found["energy_growth_frame"]), what, "use more substeps"))
         if found["inverted_tetrahedra_at_end"]:
-            problems.append(f"{found['inverted_tetrahedra_at_end']:.0f} tetrahedra are inverted at the end")
-        if not found["max_speed"] <= MAX_SPEED_RATIO * np.sqrt(2 * GRAVITY * positions[0, :, 2].max()):
-            problems.append(f"a node moves at {found['max_speed']:.1f} m/s, faster than any fall explains")
+            what = f"{found['inverted_tetrahedra_at_end']:.0f} tetrahedra are inverted at the end"
+            problems.append(problem(len(positions) - 1, what, REMEDY))
+        limit = MAX_SPEED_RATIO * np.sqrt(2 * GRAVITY * positions[0, :, 2].max())
+        if not found["max_speed"] <= limit:
+            what = f"a node moves at {found['max_speed']:.1f} m/s, faster than any fall explains ({limit:.1f} m/s)"
+            problems.append(problem(int(found["max_speed_frame"]), what, REMEDY))
         return problems
 
     def extreme_materials(self, parameters: FallParameters) -> tuple[FallParameters, FallParameters]:
@@ -262,7 +283,7 @@ class _FallingObjects(SingleTask):
             return body, level.vbd_substeps
         from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 
-        solid = ExplicitSolid(start, tetrahedra, **scene)
+        solid = ExplicitSolid(start, tetrahedra, nodal_pressure=level.nodal_pressure, **scene)
         return solid, solid.substeps(FRAME_TIME, level.courant)
 
 

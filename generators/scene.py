@@ -39,12 +39,19 @@ class Scene(Protocol):
         """Draw parameters. Factors that a split must cover evenly cycle with `index`."""
         ...
 
-    def simulate(self, parameters: Any, fidelity: Fidelity) -> Trajectory:
+    def simulate(self, parameters: Any, fidelity: Fidelity = "default") -> Trajectory:
         """Simulate; raises SolverError where no solution is found."""
         ...
 
+    def simulate_with(self, parameters: Any, level: Any, frames: int | None = None) -> Trajectory:
+        """The same with a discretisation of one's own (like those in `fidelities`), or of another length."""
+        ...
+
     def check(self, trajectory: Trajectory) -> list[str]:
-        """Reasons why the trajectory must not enter a dataset; empty if it may."""
+        """Reasons why the trajectory must not enter a dataset; empty if it may.
+
+        Each names the frame, what is wrong by how much, and a remedy (see `errors.problem`).
+        """
         ...
 
     def extreme_materials(self, parameters: Any) -> tuple[Any, Any]:
@@ -63,6 +70,24 @@ class Scene(Protocol):
     def simulator_versions(self) -> dict[str, str]:
         """Versions of the libraries whose code shapes the numbers."""
         ...
+
+
+class Leveled:
+    """Part of a scene that simulates with discretisations which have names."""
+
+    fidelities: ClassVar[dict[str, Any]]
+
+    def simulate(self, parameters: Any, fidelity: Fidelity = "default") -> Trajectory:
+        """Simulate all frames of the scene.
+
+        Raises:
+            SolverError: no solution was found; names the frame.
+        """
+        return self.simulate_with(parameters, self.fidelities[fidelity])
+
+    def simulate_with(self, parameters: Any, level: Any, frames: int | None = None) -> Trajectory:
+        """To be defined by the scene."""
+        raise NotImplementedError
 
 
 class SingleTask:

@@ -12,9 +12,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from m3gn_bench.datasets.schema import Fidelity, Split
+from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.scene import SimulatedWithScikitFem
+from m3gn_bench.generators.errors import problem
+from m3gn_bench.generators.scene import Leveled, SimulatedWithScikitFem
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.plate import ClampedPlate
 from m3gn_bench.generators.solvers.quasistatic import load_path
@@ -36,6 +37,7 @@ IN_DISTRIBUTION = (60.0, 500.0)  # [MPa], the training range of the out-of-distr
 # A St. Venant-Kirchhoff bar loses stability in compression at the stretch 1/sqrt(3). Two opposite forces side
 # by side on the softest sheet reach a strain of -0.16 and, in tension, where the law is stable, of 0.5.
 MIN_PRINCIPAL_STRAIN = -1 / 3
+REMEDY = "use a smaller force, a stiffer sheet, or keep forces further from the border and from each other"
 SNAP_MARGIN = 1e-3  # [mm], below which a step is round-off of float32 positions
 
 
@@ -58,7 +60,7 @@ class SheetFidelity:
 
 
 @dataclass(frozen=True)
-class SheetDeformation(SimulatedWithScikitFem):
+class SheetDeformation(Leveled, SimulatedWithScikitFem):
     """The scene. Positions in mm, moduli in MPa, forces in N; a frame is 1/50 of the load."""
 
     name: ClassVar[str] = "sheet_deformation"
@@ -90,17 +92,20 @@ class SheetDeformation(SimulatedWithScikitFem):
             forces=(float(signs[0]) * FORCE, float(signs[1]) * FORCE),
         )
 
-    def simulate(self, parameters: SheetParameters, fidelity: Fidelity = "default") -> Trajectory:
-        """Equilibria at 0, 1/50, ..., 1 of the load.
+    def simulate_with(
+        self, parameters: SheetParameters, level: SheetFidelity, frames: int | None = None
+    ) -> Trajectory:
+        """Equilibria at 0, 1/50, 2/50, ... of the load, 51 of them if not told otherwise.
 
         Raises:
             SolverError: the equilibrium path is lost.
         """
-        level = self.fidelities[fidelity]
+        increments = (self.frames if frames is None else frames) - 1
         plate = self.plate(parameters.youngs_modulus, level.refinement)
         load = self._load(plate, parameters)
         newton = ModifiedNewton(plate, tolerance=level.tolerance)
-        states = load_path(newton, load[plate.assembler.free], INCREMENTS)
+        applied = load[plate.assembler.free] * (increments / INCREMENTS)
+        states = load_path(newton, applied, increments)
 
         recorded, mesh = self._recorded(plate)
         positions = plate.nodes[recorded] + plate.displacements(states)[:, recorded]
@@ -130,24 +135,46 @@ class SheetDeformation(SimulatedWithScikitFem):
     def check(self, trajectory: Trajectory) -> list[str]:
         """Finite, clamped, no cell folded over, no snap, material stable."""
         positions = trajectory.positions.astype(np.float64)
-        if not np.isfinite(positions).all():
-            return ["positions are not finite"]
+        finite = np.isfinite(positions).all((1, 2))
+        if not finite.all():
+            return [problem(int(finite.argmin()), "positions are not finite", REMEDY)]
         problems = []
         fixed = trajectory.mesh.node_type == FIXED
-        if np.abs(positions[:, fixed] - trajectory.mesh.rest_positions[fixed]).max() > 0:
-            problems.append("a clamped node moves")
+        moved = np.abs(positions[:, fixed] - trajectory.mesh.rest_positions[fixed]).max((1, 2))
+        if moved.any():
+            problems.append(
+                problem(int(moved.argmax()), f"a clamped node moves by {moved.max():.2g} mm", "clamp it")
+            )
         corners = positions[:, trajectory.mesh.cells]
         normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-        if normals[..., 2].min() <= 0:
-            problems.append("a cell folds over")
+        upwards = normals[..., 2].min(1)
+        if upwards.min() <= 0:
+            frame = int(np.flatnonzero(upwards <= 0)[0])
+            problems.append(
+                problem(frame, f"a cell folds over (its projected area is {upwards[frame]:.2g} mm²)", REMEDY)
+            )
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(-1)
         # The sheet stiffens as it deflects, so every increment moves it less than the one before.
         snaps = np.flatnonzero(steps[1:] > 1.5 * steps[:-1] + SNAP_MARGIN)
         if snaps.size:
-            problems.append(f"the sheet snaps in frame {snaps[0] + 2}")
+            before, after = steps[snaps[0]], steps[snaps[0] + 1]
+            problems.append(
+                problem(
+                    int(snaps[0]) + 2,
+                    f"the sheet snaps: a node moves by {after:.2g} mm after {before:.2g} mm in the frame before",
+                    REMEDY,
+                )
+            )
         strain = trajectory.diagnostics["min_principal_strain"]
         if strain < MIN_PRINCIPAL_STRAIN:
-            problems.append(f"compressive membrane strain {strain:.2f}: beyond the material law's stability")
+            problems.append(
+                problem(
+                    len(positions) - 1,
+                    f"compressive membrane strain {strain:.2f}, beyond the material law's stability at "
+                    f"{MIN_PRINCIPAL_STRAIN:.2f}",
+                    REMEDY,
+                )
+            )
         return problems
 
     def extreme_materials(self, parameters: SheetParameters) -> tuple[SheetParameters, SheetParameters]:

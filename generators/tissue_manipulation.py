@@ -2,12 +2,13 @@
 
 A curved slab of tissue is held up to a height of 25 mm. A rigid gripper has grasped a small patch of its top,
 through the whole thickness, and moves at constant speed in the plane of the wall, away from the foot. Three
-materials occur, each a Poisson's ratio with a Young's modulus of its own. The scene's energies are those of a
-three-dimensional solid at finite strain and of inertia; there is no contact and no gravity. Source: paper,
+materials occur, each a Poisson's ratio with a Young's modulus of its own. The only energy is that of a
+three-dimensional solid at finite strain: inertia would change the path by less than the mesh does (see the
+card), so every frame is an equilibrium; there is no contact and no gravity. Source: paper,
 sections 5 and C; materials, numbers of nodes and time step follow the description of the original data, while
 the slab's shape is our own.
 
-Units are mm, g and s, so forces are in uN and stresses in uN/mm^2 = Pa.
+Units are mm and Pa, so forces are in uN.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -19,11 +20,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import LinAlgError
 from scipy.sparse import csr_matrix
-from skfem import Basis, ElementHexS2, MeshHex, MeshHex2
+from skfem import Basis, ElementHex1, ElementHexS2, MeshHex, MeshHex2
 
-from m3gn_bench.datasets.schema import Fidelity, Split
+from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.scene import SimulatedWithScikitFem, SingleTask
+from m3gn_bench.generators.errors import problem
+from m3gn_bench.generators.scene import Leveled, SimulatedWithScikitFem, SingleTask
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
@@ -46,8 +48,6 @@ OUTLINE = np.array(  # height, left edge, right edge [mm]; monotone cubics in be
 LATTICE = (6, 3, 4, 14)  # recorded cells along x, along y, and along z below and above FIXED_HEIGHT
 
 MATERIALS = ((-0.9, 10e3), (0.0, 80e3), (0.49, 30e3))  # Poisson's ratio, Young's modulus [Pa]
-DENSITY = 1.07e-3  # [g/mm^3]
-DAMPING = 20.0  # [1/s], mass-proportional
 
 PATCHES = 19  # evenly spaced along the top
 PATCH_WIDTH = 1 / 6  # of the slab's
@@ -60,9 +60,11 @@ CELL_ORDER = 5  # 3 x 3 x 3 Gauss points: with fewer, serendipity hexahedra hour
 
 MIN_JACOBIAN = 0.1  # beyond this cells are close to inversion
 MIN_CELL_AREA = 0.1  # of a recorded triangle's area at rest
-RENEWAL_INTERVAL = 20  # frames after which the solver starts afresh, and stability is tested
+RENEWAL_INTERVAL = 5  # frames after which the solver starts afresh
+STABILITY_INTERVAL = 20  # frames after which stability is tested
 MAX_STEP = 4.0  # of the gripper's
 MAX_ASYMMETRY = 1e-3  # [mm], between both faces of the wall
+REMEDY = "pull away from the foot instead of pushing, or less far"
 GRIPPER_TOLERANCE = 1e-4  # [mm], above the round-off of float32 positions
 
 
@@ -91,22 +93,27 @@ class TissueParameters:
         return np.array([np.cos(angle), 0.0, np.sin(angle)])
 
 
+# Integrated with full 3 x 3 x 3 Gauss points. Trilinear hexahedra are there to be compared: they lock.
+ELEMENTS = {"serendipity": ElementHexS2(), "trilinear": ElementHex1()}
+
+
 @dataclass(frozen=True)
 class TissueFidelity:
     """Discretisation: cells along x (a multiple of six), along y and above the held foot along z (a multiple
-    of eight), time steps per frame, and Newton's tolerance relative to the reaction."""
+    of eight), steps per frame, Newton's tolerance relative to the reaction, and the element, one of `ELEMENTS`."""
 
     cells: tuple[int, int, int]
     steps: int
     tolerance: float
+    element: str = "serendipity"
 
 
 @dataclass(frozen=True)
-class TissueManipulation(SingleTask, SimulatedWithScikitFem):
+class TissueManipulation(Leveled, SingleTask, SimulatedWithScikitFem):
     """The scene. Positions in mm, Young's modulus in Pa, time in s."""
 
     name: ClassVar[str] = "tissue_manipulation"
-    dataset_version: ClassVar[str] = "1.0"
+    dataset_version: ClassVar[str] = "2.0"
     tasks: ClassVar[tuple[str, ...]] = ("tissue_manipulation",)
     paper_sizes: ClassVar[dict[Split, int]] = {"train": 600, "validation": 120, "test": 120}
     frames: ClassVar[int] = TRANSITIONS + 1
@@ -134,21 +141,16 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
             angle=float(rng.uniform(0, 180)),
         )
 
-    def simulate(self, parameters: TissueParameters, fidelity: Fidelity = "default") -> Trajectory:
-        """Pull for 100 frames, from rest.
+    def simulate_with(
+        self, parameters: TissueParameters, level: TissueFidelity, frames: int | None = None
+    ) -> Trajectory:
+        """Equilibria while the gripper pulls, 100 frames long if not told otherwise.
 
         Raises:
-            SolverError: a time step has no solution.
+            SolverError: a step has no solution.
         """
-        return self.simulate_with(parameters, self.fidelities[fidelity])
-
-    def simulate_with(self, parameters: TissueParameters, level: TissueFidelity) -> Trajectory:
-        """The same with a discretisation of one's own.
-
-        Raises:
-            SolverError: a time step has no solution.
-        """
-        slab = make_slab(parameters.patch, level.cells)
+        frames = self.frames if frames is None else frames
+        slab = make_slab(parameters.patch, level.cells, level.element)
         law = NeoHookean.from_youngs_modulus(parameters.youngs_modulus, parameters.poisson_ratio, "3d")
         velocity = parameters.speed * parameters.direction
         potential = IncrementalPotential(
@@ -158,24 +160,24 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
         dynamics = ImplicitDynamics(
             potential,
             newton,
-            density=DENSITY,
-            damping=DAMPING,
+            density=0.0,
             prescribed=lambda time: slab.prescribed(time * velocity),
         )
-        displacements = np.zeros((self.frames, len(surface().mesh.rest_positions), 3))
-        forces = np.zeros((self.frames, 3))
-        unstable_frames = 0
-        for frame in range(1, self.frames):
-            dynamics.advance(frame * FRAME, level.steps, f"frame {frame} of {TRANSITIONS}")
+        displacements = np.zeros((frames, len(surface().mesh.rest_positions), 3))
+        forces = np.zeros((frames, 3))
+        unstable_frames: list[int] = []
+        for frame in range(1, frames):
+            dynamics.advance(frame * FRAME, level.steps, f"frame {frame} of {frames - 1}")
             displacements[frame] = slab.interpolation @ dynamics.displacement.reshape(-1, 3)
             forces[frame] = slab.gripper_force(potential.reaction)
             if frame % RENEWAL_INTERVAL == 0:
                 # A wall under tension gets stiffer against bending out of its plane. Once that stiffness has
                 # doubled, Newton's iterations with an old factorisation would amplify round-off there.
                 newton.forget()
-                unstable_frames += not slab.is_stable(law, dynamics.displacement)
+            if frame % STABILITY_INTERVAL == 0 and not slab.is_stable(law, dynamics.displacement):
+                unstable_frames.append(frame)
 
-        path = FRAME * np.arange(self.frames)[:, None] * velocity
+        path = FRAME * np.arange(frames)[:, None] * velocity
         return Trajectory(
             positions=(surface().rest_positions + displacements).astype(np.float32),
             mesh=surface().mesh,
@@ -192,8 +194,9 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
                 **asdict(newton.statistics),
                 "min_jacobian": dynamics.min_jacobian,
                 "max_gripper_force_newton": 1e-6 * float(np.linalg.norm(forces, axis=1).max()),
-                "max_asymmetry_mm": asymmetry(displacements),
-                "unstable_frames": unstable_frames,
+                "max_asymmetry_mm": float(asymmetry(displacements).max()),
+                "unstable_frames": len(unstable_frames),
+                "first_unstable_frame": unstable_frames[0] if unstable_frames else 0,
             },
         )
 
@@ -202,39 +205,53 @@ class TissueManipulation(SingleTask, SimulatedWithScikitFem):
         positions = trajectory.positions.astype(np.float64)
         gripper = trajectory.collider_positions
         assert gripper is not None
-        if not (np.isfinite(positions).all() and np.isfinite(gripper).all()):
-            return ["positions are not finite"]
+        finite = np.isfinite(positions).all((1, 2)) & np.isfinite(gripper).all((1, 2))
+        if not finite.all():
+            return [problem(int(finite.argmin()), "positions are not finite", REMEDY)]
         problems = []
         mesh = trajectory.mesh
         displacements = positions - mesh.rest_positions
         path = gripper[:, 0].astype(np.float64) - gripper[0, 0]
-        if np.abs(displacements[:, mesh.node_type == FIXED]).max() > 0:
-            problems.append("a fixed node moves")
+        moved = np.abs(displacements[:, mesh.node_type == FIXED]).max((1, 2))
+        if moved.any():
+            problems.append(
+                problem(int(moved.argmax()), f"a fixed node moves by {moved.max():.2g} mm", "hold it")
+            )
         grasped = surface().grasped(int(trajectory.loads["patch"][0]))
-        slip = np.abs(displacements[:, grasped] - path[:, None]).max()
-        if slip > GRIPPER_TOLERANCE:
-            problems.append(f"a grasped node strays from the gripper by {slip:.2g} mm")
+        slip = np.abs(displacements[:, grasped] - path[:, None]).max((1, 2))
+        if slip.max() > GRIPPER_TOLERANCE:
+            what = f"a grasped node strays from the gripper by {slip.max():.2g} mm"
+            problems.append(problem(int(slip.argmax()), what, "move it with the gripper"))
         normals = _area_vectors(positions, mesh.cells)
         areas = np.linalg.norm(normals, axis=-1)
-        crushed = np.flatnonzero((areas < MIN_CELL_AREA * areas[0]).any(1))
+        shares = (areas / areas[0]).min(1)
+        crushed = np.flatnonzero(shares < MIN_CELL_AREA)
         if crushed.size:
-            problems.append(f"a cell is crushed in frame {crushed[0]}")
-        flipped = np.flatnonzero((np.einsum("fci,fci->fc", normals[1:], normals[:-1]) <= 0).any(1))
+            what = f"a cell is crushed to {shares[crushed[0]]:.2f} of its area"
+            problems.append(problem(int(crushed[0]), what, REMEDY))
+        turns = np.einsum("fci,fci->fc", normals[1:], normals[:-1]) / (areas[1:] * areas[:-1] + 1e-300)
+        flipped = np.flatnonzero((turns <= 0).any(1))
         if flipped.size:
-            problems.append(f"a cell turns over in frame {flipped[0] + 1}")
-        smallest = trajectory.diagnostics["min_jacobian"]
-        if smallest < MIN_JACOBIAN:
-            problems.append(f"the tissue is compressed to {smallest:.3f} of its volume")
+            angle = np.degrees(np.arccos(np.clip(turns[flipped[0]].min(), -1, 1)))
+            problems.append(
+                problem(int(flipped[0]) + 1, f"a cell turns over, by {angle:.0f} degrees in a frame", REMEDY)
+            )
+        found = trajectory.diagnostics
+        if found["min_jacobian"] < MIN_JACOBIAN:
+            what = f"the tissue is compressed to {found['min_jacobian']:.3f} of its volume"
+            problems.append(problem(len(positions) - 1, what, REMEDY))
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(-1)
         allowed = MAX_STEP * np.linalg.norm(np.diff(path, axis=0), axis=-1).max() + GRIPPER_TOLERANCE
         jumps = np.flatnonzero(steps > allowed)
         if jumps.size:
-            problems.append(f"a node jumps by {steps[jumps[0]]:.2f} mm in frame {jumps[0] + 1}")
-        if trajectory.diagnostics["unstable_frames"]:
-            problems.append("the pull compresses the wall until its equilibrium is unstable: it may buckle")
+            problems.append(problem(int(jumps[0]) + 1, f"a node jumps by {steps[jumps[0]]:.2f} mm", REMEDY))
+        if found["unstable_frames"]:
+            what = "the equilibrium is unstable (its stiffness is not positive definite): the wall may buckle"
+            problems.append(problem(int(found["first_unstable_frame"]), what, REMEDY))
         out_of_plane = asymmetry(displacements)
-        if out_of_plane > MAX_ASYMMETRY:
-            problems.append(f"the wall buckles out of its plane, by {out_of_plane:.2g} mm")
+        if out_of_plane.max() > MAX_ASYMMETRY:
+            what = f"the wall buckles out of its plane, by {out_of_plane.max():.2g} mm"
+            problems.append(problem(int(out_of_plane.argmax()), what, REMEDY))
         return problems
 
     def extreme_materials(self, parameters: TissueParameters) -> tuple[TissueParameters, TissueParameters]:
@@ -378,7 +395,7 @@ class Slab:
 
 
 @lru_cache(maxsize=PATCHES)
-def make_slab(patch: int, cells: tuple[int, int, int]) -> Slab:
+def make_slab(patch: int, cells: tuple[int, int, int], element: str = "serendipity") -> Slab:
     """The slab with so many cells along x, y and z, whose lines run along the patch's edges."""
     nx, ny, nz = cells
     straight = MeshHex.init_tensor(
@@ -386,11 +403,11 @@ def make_slab(patch: int, cells: tuple[int, int, int]) -> Slab:
         np.linspace(-THICKNESS / 2, THICKNESS / 2, ny + 1),
         np.linspace(FIXED_HEIGHT, HEIGHT, nz + 1),
     )
-    element = ElementHexS2()
-    straight_basis = Basis(straight, element, intorder=1)
+    shape_functions = ELEMENTS[element]
+    straight_basis = Basis(straight, shape_functions, intorder=1)
     curved = MeshHex2.from_mesh(straight)
     curved = MeshHex2(np.ascontiguousarray(to_physical(curved.doflocs.T).T), curved.t)
-    solid = Solid(curved, element, integration_order=CELL_ORDER)
+    solid = Solid(curved, shape_functions, integration_order=CELL_ORDER)
 
     coordinates = straight_basis.doflocs.T
     held = in_patch(coordinates, patch)
@@ -417,10 +434,15 @@ def _columns(patch: int, parts: int) -> Array:
     return np.interp(np.arange(6 * parts + 1) / parts, np.arange(7), lines)
 
 
-def asymmetry(displacements: Array) -> float:
-    """Largest deviation [mm] from symmetry in the wall's middle plane, of displacements [frames, 361, 3]."""
+def asymmetry(displacements: Array) -> Array:
+    """Largest deviation [mm] from symmetry in the wall's middle plane in each frame, shape [frames].
+
+    Args:
+        displacements: of the recorded vertices [mm], shape [frames, 361, 3].
+    """
     mirrored = displacements[:, surface().mirrored] * (1, -1, 1)
-    return float(np.linalg.norm(displacements - mirrored, axis=-1).max())
+    deviations: Array = np.linalg.norm(displacements - mirrored, axis=-1).max(-1)
+    return deviations
 
 
 def _area_vectors(positions: Array, cells: NDArray[np.int32]) -> Array:

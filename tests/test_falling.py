@@ -103,8 +103,8 @@ def test_a_motion_that_diverges_is_computed_with_smaller_steps() -> None:
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        (lambda t: t.positions.__setitem__((80, 3, 1), np.nan), "not finite from frame 80"),
-        (lambda t: t.positions.__setitem__((90, 7, 2), -0.01), r"0.01 m below the floor in frame 90"),
+        (lambda t: t.positions.__setitem__((80, 3, 1), np.nan), "frame 80: positions are not finite"),
+        (lambda t: t.positions.__setitem__((90, 7, 2), -0.01), "frame 90: a node is 0.01 m below the floor"),
         (lambda t: t.diagnostics.update(energy_growth=0.02), "energy grows by 2.00%"),
         (lambda t: t.diagnostics.update(inverted_tetrahedra_at_end=3), "3 tetrahedra are inverted"),
         (lambda t: t.diagnostics.update(max_speed=100.0), "100.0 m/s"),

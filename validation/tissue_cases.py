@@ -12,8 +12,6 @@ from m3gn_bench.generators.solvers.finite_strain import NeoHookean
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.sparse import Array
 from m3gn_bench.generators.tissue_manipulation import (
-    DAMPING,
-    DENSITY,
     FRAME,
     MATERIALS,
     THICKNESS,
@@ -28,6 +26,8 @@ from m3gn_bench.generators.tissue_manipulation import (
 __all__ = ["CASES", "DEFAULT", "FAST", "GRAVITY", "displacements", "draw", "march", "relative_error"]
 
 GRAVITY = 9810.0  # [mm/s^2]
+DENSITY = 1.07e-3  # [g/mm^3]; with it units are mm, g and s
+DAMPING = 20.0  # [1/s], mass-proportional
 DEFAULT = TissueManipulation.fidelities["default"]
 FAST = TissueManipulation.fidelities["fast"]
 

@@ -59,7 +59,7 @@ class CapturedSolid(TetrahedralSolid):
             if not np.isfinite(path[frame]).all():
                 raise SolverError(
                     f"frame {first_frame + frame}: positions are not finite; "
-                    f"{self._effort(substeps)} per frame are too few"
+                    f"{self._effort(substeps)} per frame are too few: use more, or a softer body"
                 )
         return Motion(path, speeds, lag=substep / 2)
 

@@ -243,7 +243,8 @@ class ImplicitDynamics:
                     if depth == MAX_BISECTIONS:
                         raise SolverError(
                             f"{label}: the step from time {self.time:.6g} to {until:.6g} fails after "
-                            f"{MAX_BISECTIONS} bisections: {error}; smallest J {self.potential.min_jacobian:.3g}"
+                            f"{MAX_BISECTIONS} bisections: {error}, smallest J {self.potential.min_jacobian:.3g}; move "
+                            "what deforms the body less far, or more slowly"
                         ) from error
                     self.newton.statistics.bisections += 1
                     pending[-1] = (until, depth + 1)

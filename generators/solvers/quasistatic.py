@@ -41,7 +41,10 @@ def load_path(newton: ModifiedNewton, load: Array, increments: int) -> Array:
                     newton, states[k - 1], load, (k - 1) / increments, k / increments, scale, MAX_BISECTIONS
                 )
             except SolverError as error:
-                raise SolverError(f"frame {k} of {increments}: {error}") from error
+                raise SolverError(
+                    f"frame {k} of {increments}: {error} at {k / increments:.0%} of the load, after "
+                    f"{MAX_BISECTIONS} bisections; use a smaller load or a stiffer body"
+                ) from error
     return states
 
 
