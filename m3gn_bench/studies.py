@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.version import __version__
 
@@ -45,10 +46,9 @@ def measure_cells(
     done = _read(state, head)
     try:
         state.parent.mkdir(parents=True, exist_ok=True)
-        with state.open("w") as file:
-            for line in (head, *done.values()):
-                file.write(json.dumps(line) + "\n")
-            file.flush()
+        lines = "".join(json.dumps(line) + "\n" for line in (head, *done.values()))
+        write_bytes_atomically(state, lines.encode())
+        with state.open("a") as file:
             for number, cell in enumerate(cells):
                 on_progress(number, len(cells))
                 if cell.name not in done:
