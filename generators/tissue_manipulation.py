@@ -383,7 +383,8 @@ class Slab:
     def is_stable(self, law: NeoHookean, u: Array) -> bool:
         """Whether the state u [dofs], held where it is prescribed, is a minimum of the stored energy alone.
 
-        Inertia slows buckling so much that a simulation stays on an unstable path; real tissue would not.
+        Newton's method may stay on the symmetric path beyond the point where it is no minimum any more; real
+        tissue would not.
         """
         solid, assembler = self.body.solid, self.body.assembler
         stiffness = assembler.matrix(solid.element_stiffness(solid.response(u, law)))

@@ -1,10 +1,10 @@
-"""The tissue scene: meshes, time steps, stability, random draws and extremes."""
+"""The tissue scene: meshes, steps, stability, random draws and extremes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tissue_cases import CASES, DEFAULT, FAST, GRAVITY, displacements, draw, march, relative_error
+from tissue_cases import CASES, DEFAULT, DENSITY, FAST, GRAVITY, displacements, draw, march, relative_error
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.sparse import Array
@@ -30,7 +30,7 @@ FINE_CELLS = (12, 1, 32)
 def _static(parameters: TissueParameters, cells: tuple[int, int, int], steps: int = 10) -> Array:
     """Displacements in equilibrium after the whole pull, in so many steps, shape [361, 3]."""
     level, stride = TissueFidelity(cells, 1, 1e-5), TRANSITIONS / steps
-    return march(parameters, level, density=0.0, transitions=steps, distance=lambda t: stride * t)[-1]
+    return march(parameters, level, transitions=steps, distance=lambda t: stride * t)[-1]
 
 
 @pytest.mark.parametrize(
@@ -47,27 +47,21 @@ def test_meshes(case: TissueParameters, allowed: tuple[float, ...]) -> None:
     assert errors[1] < 0.6 * errors[0], f"twice the rows must pay: {errors}"
 
 
-# --- time -------------------------------------------------------------------------------------------------
+# --- steps ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", CASES, ids=NAMES)
-def test_half_the_time_step(case: TissueParameters) -> None:
-    """The gripper starts at once: the wave that this sends through the tissue is damped, not resolved.
-
-    The largest difference that half the step makes is a third of what the gripper moves per frame, in the
-    first ten frames; over the whole path it is 0.1 %, and at its end nothing.
-    """
+def test_equilibria_do_not_depend_on_the_number_of_steps(case: TissueParameters) -> None:
+    """Twice as many steps, or a tenth of them: the same states, up to what Newton's tolerance leaves open."""
     level = replace(DEFAULT, tolerance=1e-6)
-    coarse, fine = (displacements(case, replace(level, steps=steps)) for steps in (1, 2))
-    largest = np.linalg.norm(coarse - fine, axis=-1).max(1)
-    assert largest.max() < 0.12, f"{largest.max():.3f} mm"
-    assert largest[25:].max() < 0.02, f"{largest[25:].max():.4f} mm after 25 frames"
-    assert relative_error(coarse, fine) < 2e-3
-    assert relative_error(coarse[-1], fine[-1]) < 1e-5
+    usual = displacements(case, level)
+    assert relative_error(displacements(case, replace(level, steps=2)), usual) < 1e-5
+    assert relative_error(_static(case, DEFAULT.cells), usual[-1]) < 1e-5
 
 
-def test_second_order_in_time() -> None:
-    """Tissue so soft that the step resolves its waves, and a gripper that starts smoothly."""
+def test_dynamics_are_of_second_order_in_time() -> None:
+    """With inertia, which the scene leaves out: tissue so soft that the step resolves its waves, and a gripper
+    that starts smoothly."""
     case, frames = replace(CASES[2], youngs_modulus=300.0), 20
     duration = frames * FRAME
 
@@ -75,7 +69,13 @@ def test_second_order_in_time() -> None:
         return 0.5 * duration * (at / duration) ** 3
 
     states = {
-        steps: march(case, TissueFidelity((6, 1, 8), steps, 1e-7), distance=distance, transitions=frames)
+        steps: march(
+            case,
+            TissueFidelity((6, 1, 8), steps, 1e-7),
+            density=DENSITY,
+            distance=distance,
+            transitions=frames,
+        )
         for steps in (1, 2, 4, 16)
     }
     errors = np.array([np.linalg.norm(states[steps] - states[16]) for steps in (1, 2, 4)])
@@ -101,7 +101,7 @@ def _amplification(parameters: TissueParameters) -> float:
         march(replace(parameters, speed=speed), level, acceleration=sideways)
         for speed in (parameters.speed, 0.0)
     )
-    return asymmetry(pulled) / asymmetry(still)
+    return float(asymmetry(pulled).max() / asymmetry(still).max())
 
 
 WORST_PULLS = ((0, 0.0), (PATCHES - 1, 180.0))  # across the wall: they compress one side of it
@@ -115,17 +115,17 @@ def test_worst_pulls_are_stable(material: tuple[float, float], patch: int, angle
 
 
 def test_disturbances_grow_in_pushes_only() -> None:
-    """At nu = 0, where they grow most: by a factor of 8 in the worst pull, of 1000 in a push."""
+    """At nu = 0, where they grow most: by a factor of 16 in the worst pull, of 1000 in a push."""
     for patch, angle in WORST_PULLS:
-        assert _amplification(TissueParameters(*MATERIALS[1], patch=patch, angle=angle)) < 12
+        assert _amplification(TissueParameters(*MATERIALS[1], patch=patch, angle=angle)) < 20
     assert _amplification(TissueParameters(*MATERIALS[1], patch=9, angle=-90.0)) > 300
 
 
 @pytest.mark.parametrize("material", MATERIALS, ids=NAMES)
 def test_pushes_are_rejected(material: tuple[float, float]) -> None:
-    """What disturbs the wall would decide where it goes."""
+    """What disturbs the wall would decide where it goes: here it is round-off, so the wall has left its plane."""
     push = TissueParameters(*material, patch=9, angle=-90.0)
-    assert any("unstable" in problem for problem in SCENE.check(SCENE.simulate(push)))
+    assert any("buckles out of its plane" in problem for problem in SCENE.check(SCENE.simulate(push)))
 
 
 # --- draws ------------------------------------------------------------------------------------------------

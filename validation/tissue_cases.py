@@ -14,6 +14,7 @@ from m3gn_bench.generators.solvers.sparse import Array
 from m3gn_bench.generators.tissue_manipulation import (
     FRAME,
     MATERIALS,
+    RENEWAL_INTERVAL,
     THICKNESS,
     TRANSITIONS,
     Slab,
@@ -23,11 +24,21 @@ from m3gn_bench.generators.tissue_manipulation import (
     make_slab,
 )
 
-__all__ = ["CASES", "DEFAULT", "FAST", "GRAVITY", "displacements", "draw", "march", "relative_error"]
+__all__ = [
+    "CASES",
+    "DEFAULT",
+    "DENSITY",
+    "FAST",
+    "GRAVITY",
+    "displacements",
+    "draw",
+    "march",
+    "relative_error",
+]
 
 GRAVITY = 9810.0  # [mm/s^2]
-DENSITY = 1.07e-3  # [g/mm^3]; with it units are mm, g and s
-DAMPING = 20.0  # [1/s], mass-proportional
+DENSITY = 1.07e-3  # [g/mm^3], of the tissue where it is not quasi-static; with it units are mm, g and s
+DAMPING = 20.0  # [1/s], mass-proportional, so without effect on a quasi-static pull
 DEFAULT = TissueManipulation.fidelities["default"]
 FAST = TissueManipulation.fidelities["fast"]
 
@@ -100,7 +111,7 @@ def march(
     parameters: TissueParameters,
     level: TissueFidelity = DEFAULT,
     *,
-    density: float = DENSITY,
+    density: float = 0.0,
     acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0),
     stiffness_damping: float = 0.0,
     distance: Callable[[float], float] = lambda time: time,
@@ -111,13 +122,13 @@ def march(
     Args:
         parameters: the draw.
         level: the discretisation.
-        density: 0 for a quasi-static pull.
+        density: of the inertia; 0, as in the scene, for a quasi-static pull.
         acceleration: body force per mass [mm/s^2], e.g. of gravity.
         stiffness_damping: Rayleigh's coefficient [s]; only with one step per frame.
         distance: the gripper's travel over its speed at a time [s].
         transitions: how many frames to march.
     """
-    slab = make_slab(parameters.patch, level.cells)
+    slab = make_slab(parameters.patch, level.cells, level.element)
     law = NeoHookean.from_youngs_modulus(parameters.youngs_modulus, parameters.poisson_ratio, "3d")
     velocity = parameters.speed * parameters.direction
     floor = 1e-9 * parameters.youngs_modulus * THICKNESS**2
@@ -133,9 +144,10 @@ def march(
         )
     else:
         potential = IncrementalPotential(slab.body, law, force_floor=floor)
+    newton = ModifiedNewton(potential, tolerance=level.tolerance)
     dynamics = ImplicitDynamics(
         potential,
-        ModifiedNewton(potential, tolerance=level.tolerance),
+        newton,
         density=density,
         damping=DAMPING,
         prescribed=lambda time: slab.prescribed(distance(time) * velocity),
@@ -146,4 +158,6 @@ def march(
             potential.begin_frame(dynamics.displacement)
         dynamics.advance(frame * FRAME, level.steps, f"frame {frame}")
         states[frame] = slab.interpolation @ dynamics.displacement.reshape(-1, 3)
+        if frame % RENEWAL_INTERVAL == 0:  # as the scene does
+            newton.forget()
     return states
