@@ -1,10 +1,10 @@
 """Deformable Block: a rigid circle is pressed into an elastic block whose material changes on the way.
 
-A trapezoidal block stands on the ground, its base clamped. A rigid, frictionless circle moves down at constant
+A trapezoidal block stands on its clamped base. A rigid, frictionless circle moves down at constant
 speed. For eleven frames the block has one Poisson's ratio; then it gets another, and from there 39 frames are
 recorded: the first of them shows a state with a history, and what must be inferred is the second ratio. The
-scene's energies are those of a two-dimensional solid at finite strain, of its contact with the circle and the
-ground, and of inertia, which is there to make the sudden change of material a short transient instead of a
+scene's energies are those of a two-dimensional solid at finite strain, of its contact with the circle, and of
+inertia, which is there to make the sudden change of material a short transient instead of a
 jump. Source: paper, sections 5 and C; sizes, ratios and numbers follow the description of the original data.
 """
 
@@ -21,14 +21,14 @@ from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TRIANGLE, Mesh, Trajectory
 from m3gn_bench.generators.errors import GeneratorError, problem
 from m3gn_bench.generators.scene import Leveled, SimulatedWithScikitFem, SingleTask
-from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
+from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.sparse import Array
 
 HEIGHT = 200.0  # [mm]
-BASE = -100.0  # [mm], where the base and the ground are
+BASE = -100.0  # [mm], where the base is
 TRAPEZOIDS = (  # (bottom, top) widths [mm]
     (200.0, 200.0),
     (220.0, 180.0),
@@ -243,7 +243,7 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
         contact = PenaltyContact(
             contact_points,
             penalty=PENALTY_RATIO * parameters.youngs_modulus,
-            obstacles=[disc, Floor(BASE)],
+            obstacles=[disc],
         )
         potential = IncrementalPotential(
             body,
@@ -334,7 +334,7 @@ class Block:
 
     Attributes:
         body: the solid, and its clamped base.
-        contact_points: on the top and the sides, which may touch the circle and the ground.
+        contact_points: on the top and the sides, which may touch the circle.
         surface_points: the same boundary, sampled more densely than contact looks at it.
         recorded: nodes of the solid on the recorded lattice, row by row from the base, shape [81].
         mesh: the recorded mesh.

@@ -352,6 +352,11 @@ def _self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: 
     return int(penetrating.sum())
 
 
+def flight_frames(height: float) -> int:
+    """Number of frames in which a body dropped from that height [m] has not touched the floor yet."""
+    return 1 + int(np.sqrt(2 * height / GRAVITY) / FRAME_TIME)
+
+
 def _flight_times(height: float) -> np.ndarray:
-    """Times [s] of the frames in which a body dropped from that height [m] has not touched the floor yet."""
-    return FRAME_TIME * np.arange(1 + int(np.sqrt(2 * height / GRAVITY) / FRAME_TIME))
+    """Times [s] of those frames."""
+    return FRAME_TIME * np.arange(flight_frames(height))

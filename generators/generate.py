@@ -196,11 +196,11 @@ def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadat
         frames=scene.frames,
         scale_centre=scene.scale_centre,
         scale_length=scene.scale_length,
-        machine=_machine(),
+        machine=machine(),
     )
 
 
-def _machine() -> str:
+def machine() -> str:
     """The processor, for the record."""
     names = Path("/proc/cpuinfo")
     lines = names.read_text().splitlines() if names.is_file() else []

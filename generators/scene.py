@@ -1,5 +1,6 @@
 """What a scene is, and which scenes there are."""
 
+import logging
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import version
@@ -102,6 +103,10 @@ class SingleTask:
     def task_size(self, task: str, split: Split, trajectories: int) -> int:
         """All of them."""
         return trajectories
+
+
+# It warns of how it stores the nodes of every finer mesh.
+logging.getLogger("skfem").setLevel(logging.ERROR)
 
 
 class SimulatedWithScikitFem:

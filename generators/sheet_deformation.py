@@ -52,11 +52,12 @@ class SheetParameters:
 
 @dataclass(frozen=True)
 class SheetFidelity:
-    """Discretisation: parts into which each element of the scene's mesh is split along either direction, and
-    Newton's tolerance relative to the load."""
+    """Discretisation: parts into which each element of the scene's mesh is split along either direction,
+    Newton's tolerance relative to the load, and whether there is a line of nodes close to the border."""
 
     refinement: int
     tolerance: float
+    border_layer: bool = True
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class SheetDeformation(Leveled, SimulatedWithScikitFem):
             SolverError: the equilibrium path is lost.
         """
         increments = (self.frames if frames is None else frames) - 1
-        plate = self.plate(parameters.youngs_modulus, level.refinement)
+        plate = self.plate(parameters.youngs_modulus, level.refinement, level.border_layer)
         load = self._load(plate, parameters)
         newton = ModifiedNewton(plate, tolerance=level.tolerance)
         applied = load[plate.assembler.free] * (increments / INCREMENTS)
@@ -195,9 +196,11 @@ class SheetDeformation(Leveled, SimulatedWithScikitFem):
         moduli = [YOUNGS_MODULI[i % len(YOUNGS_MODULI)] for i in range(trajectories)]
         return sum(task in self.tasks_of(split, {"youngs_modulus": modulus}) for modulus in moduli)
 
-    def plate(self, youngs_modulus: float, refinement: int) -> ClampedPlate:
+    def plate(self, youngs_modulus: float, refinement: int, border_layer: bool = True) -> ClampedPlate:
         """The sheet's plate, each element split into `refinement` parts along either direction."""
-        ticks = np.union1d(np.linspace(0, SIDE, NODES_PER_SIDE), [BORDER_LAYER, SIDE - BORDER_LAYER])
+        ticks = np.linspace(0, SIDE, NODES_PER_SIDE)
+        if border_layer:
+            ticks = np.union1d(ticks, [BORDER_LAYER, SIDE - BORDER_LAYER])
         parts = np.arange(refinement) / refinement
         fine = (ticks[:-1, None] + np.diff(ticks)[:, None] * parts).ravel()
         return ClampedPlate(

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from m3gn_bench.console import Report, table
+from m3gn_bench.console import DATA, JSON, Report, table
 from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.study_commands import render_studies, stability, tradeoff
 from m3gn_bench.version import __version__
 
 if TYPE_CHECKING:
@@ -23,13 +24,6 @@ if TYPE_CHECKING:
 
 # Modules that need torch or a simulator are imported inside the commands, so that --help stays instant.
 
-JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-DATA = click.option(
-    "--data",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=lambda: Path(os.environ.get("M3GN_BENCH_DATA", "data")),
-    help="Folder of dataset files.  [default: $M3GN_BENCH_DATA, or ./data]",
-)
 THREADS = click.option(
     "--threads",
     type=click.IntRange(min=1),
@@ -861,6 +855,10 @@ def profile(
             ],
         ),
     )
+
+
+for command in (tradeoff, stability, render_studies):
+    cli.add_command(command)
 
 
 def _commit() -> str | None:

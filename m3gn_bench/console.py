@@ -1,4 +1,4 @@
-"""How the command line talks: tables and progress for people, one JSON object for programs.
+"""How the command line talks: options of many commands, tables and progress for people, one JSON object for programs.
 
 Results go to standard output, progress and errors to standard error. Progress is off where standard error is
 no terminal, and with --json.
@@ -6,9 +6,11 @@ no terminal, and with --json.
 
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import click
 from rich.console import Console
@@ -22,6 +24,13 @@ from rich.progress import (
 )
 from rich.table import Table
 
+JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+DATA = click.option(
+    "--data",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=lambda: Path(os.environ.get("M3GN_BENCH_DATA", "data")),
+    help="Folder of dataset files.  [default: $M3GN_BENCH_DATA, or ./data]",
+)
 OnProgress = Callable[[int, int], None]
 
 

@@ -1,76 +1,106 @@
 """Studies of many cells, each measured once and kept at once: interrupted, a study goes on where it stopped."""
 
+import io
 import json
+import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.version import __version__
 
+OnProgress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a cell's measurement found.
+
+    Attributes:
+        values: whatever JSON can hold.
+        arrays: and what it cannot.
+    """
+
+    values: dict[str, Any]
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
 
 @dataclass(frozen=True)
 class Cell:
-    """One measurement of a study.
-
-    Attributes:
-        name: unique in the study.
-        measure: makes the result, which JSON must be able to hold.
-    """
+    """One measurement of a study, with a name that is unique in it."""
 
     name: str
-    measure: Callable[[], dict[str, Any]]
+    measure: Callable[[], Result]
 
 
-def measure_cells(
-    cells: Sequence[Cell],
-    state: Path,
-    *,
-    settings: dict[str, Any],
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[dict[str, Any]]:
-    """The results of all cells, in order; those that an interrupted run has left in `state` are not made again.
+class Study:
+    """A folder of results, for as long as a study is not finished.
 
     Args:
-        cells: of the study.
-        state: file of results so far, one JSON object per line. The caller deletes it once the study is kept.
-        settings: what the results depend on; a state with other settings, or of another version, is dropped.
-        on_progress: called with the numbers of cells done and in total.
+        folder: where results are kept.
+        settings: what results depend on; those of other settings, or of another version, are dropped.
 
     Raises:
-        ConfigError: the state cannot be written.
+        ConfigError: the folder cannot be written.
     """
-    head = {"settings": settings, "version": __version__}
-    done = _read(state, head)
-    try:
-        state.parent.mkdir(parents=True, exist_ok=True)
-        lines = "".join(json.dumps(line) + "\n" for line in (head, *done.values()))
-        write_bytes_atomically(state, lines.encode())
-        with state.open("a") as file:
-            for number, cell in enumerate(cells):
-                on_progress(number, len(cells))
-                if cell.name not in done:
-                    done[cell.name] = {"cell": cell.name, **cell.measure()}
-                    file.write(json.dumps(done[cell.name]) + "\n")
-                    file.flush()
-    except OSError as error:
-        raise ConfigError(f"cannot write to {state}: {error.strerror or error}") from error
-    on_progress(len(cells), len(cells))
-    return [done[cell.name] for cell in cells]
 
-
-def _read(state: Path, head: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Whole lines of a state with the same head, by the cell's name."""
-    if not state.is_file():
-        return {}
-    found = []
-    for line in state.read_text().splitlines():
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        self.folder = folder
+        head = json.dumps({"settings": settings, "version": __version__}, sort_keys=True).encode()
+        written = folder / "settings.json"
         try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:  # the line that a kill has cut
-            break
-    if not found or found[0] != json.loads(json.dumps(head)):
-        return {}
-    return {result["cell"]: result for result in found[1:]}
+            if written.is_file() and written.read_bytes() != head:
+                shutil.rmtree(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_bytes_atomically(written, head)
+        except OSError as error:
+            raise ConfigError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+    def measure(self, cells: Sequence[Cell], on_progress: OnProgress) -> dict[str, Result]:
+        """The results of all cells by their names; those that an interrupted run has left are not made again."""
+        results = {}
+        for number, cell in enumerate(cells):
+            on_progress(number, len(cells))
+            path = self.folder / f"{number:03}.npz"
+            kept = _read(path)
+            if kept is None or kept.values["key"] != cell.name:
+                made = cell.measure()
+                kept = Result({**made.values, "key": cell.name}, made.arrays)
+                buffer = io.BytesIO()
+                np.savez(buffer, values=np.array(json.dumps(kept.values)), **kept.arrays)  # type: ignore[arg-type]
+                write_bytes_atomically(path, buffer.getvalue())
+            results[cell.name] = kept
+        on_progress(len(cells), len(cells))
+        return results
+
+    def finish(self) -> None:
+        """Delete the folder: what it held is kept elsewhere, and the next study begins anew."""
+        shutil.rmtree(self.folder)
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """A trained model that takes part in a study: its name, its preset, and the folder of its checkpoint."""
+
+    name: str
+    preset: str
+    folder: Path
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> float:
+    """Root mean square distance of nodes, of positions [..., nodes, dim]."""
+    squared = (one.astype(np.float64) - other.astype(np.float64)) ** 2
+    return float(np.sqrt(squared.sum(-1).mean()))
+
+
+def _read(path: Path) -> Result | None:
+    if not path.is_file():
+        return None
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    return Result(json.loads(str(arrays.pop("values"))), arrays)

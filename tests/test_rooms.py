@@ -22,7 +22,7 @@ ALLOWED = {
     "leaderboard": {"leaderboard", "m3gn_bench", "version", "datasets"},
 }
 # These reach further, but only inside functions: a model can be evaluated without a simulator installed.
-LAZY = {"m3gn_bench/cli.py", "m3gn_bench/sources.py"}
+LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", "sources", "stability", "study_commands", "tradeoff")}
 LAZILY_ALLOWED = {"generators", "leaderboard", "baselines"}
 
 

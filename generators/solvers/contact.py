@@ -62,23 +62,6 @@ class Disc:
         return offset / distance[:, None], 1 / distance
 
 
-@dataclass(frozen=True)
-class Floor:
-    """The half-space below a height along the last axis."""
-
-    height: float
-
-    def depth(self, points: Array, time: float) -> Array:
-        """See Obstacle."""
-        return self.height - points[:, -1]
-
-    def normal(self, points: Array, time: float) -> tuple[Array, Array]:
-        """See Obstacle."""
-        normal = np.zeros_like(points)
-        normal[:, -1] = 1
-        return normal, np.zeros(len(points))
-
-
 class _Touch(NamedTuple):
     """The contact points inside one obstacle: their indices, and everything weighted for integration."""
 

@@ -1,0 +1,252 @@
+"""What can be turned to trade a scene's speed for its accuracy, one knob at a time around the default fidelity.
+
+A scene is judged over a window of frames by the distance of its recorded nodes from a reference: the finest of
+three meshes, with fine steps. Every discretisation has a companion on the same mesh with fine steps, which splits
+its error: what steps and tolerances leave open is the difference from the companion, what the mesh leaves open is
+the companion's difference from the reference.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.generators.errors import GeneratorError
+
+Knob = Literal["fidelity", "time step", "mesh", "element", "tolerance", "solver"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to simulate a scene.
+
+    Attributes:
+        knob: which one is turned.
+        label: to what.
+        level: the discretisation.
+        options: of the scene, where they differ.
+    """
+
+    knob: Knob
+    label: str
+    level: Any
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Unique among a scene's settings."""
+        return f"{self.knob}: {self.label}"
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """How a scene's trade-off is measured.
+
+    Attributes:
+        draws: indices of trajectories of the test split, spread over materials and objects.
+        first, last: the frames over which distances are taken.
+        frames: that a reference needs.
+        size: what distances are divided by [the scene's unit of length]; None: by the displacement.
+        settings: all ways to simulate; "fidelity: default" is among them.
+        meshes: three levels with fine steps, from coarse to fine; the last is the reference.
+        cell_sizes: of their meshes, relative to the first.
+        with_fine_steps: the companion of a level.
+        full_length: settings of which whole trajectories are timed; of others, the cost of a frame is measured.
+    """
+
+    draws: tuple[int, ...]
+    first: int
+    last: int
+    frames: int
+    size: float | None
+    settings: tuple[Setting, ...]
+    meshes: tuple[Any, ...]
+    cell_sizes: tuple[float, float, float]
+    with_fine_steps: Callable[[Any], Any]
+    full_length: Callable[[Setting], bool] = lambda setting: True
+
+
+def _fidelities(scene: Any) -> tuple[Setting, ...]:
+    return tuple(Setting("fidelity", name, level) for name, level in scene.fidelities.items())
+
+
+def _sheet_deformation() -> Knobs:
+    from m3gn_bench.generators.sheet_deformation import SheetDeformation
+
+    default = SheetDeformation.fidelities["default"]
+
+    def fine(level: Any) -> Any:
+        return replace(level, tolerance=1e-8)
+
+    return Knobs(
+        draws=(0, 4, 8),  # E = 10, 180 and 1000 MPa
+        first=1,
+        last=50,
+        frames=51,
+        size=None,
+        settings=(
+            *_fidelities(SheetDeformation),
+            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-1, 1e-2, 1e-4)),
+            Setting("mesh", "even, 14 x 14", replace(default, border_layer=False)),
+            Setting("mesh", "even, 28 x 28", replace(default, border_layer=False, refinement=2)),
+            Setting("mesh", "32 x 32", replace(default, refinement=2)),
+        ),
+        meshes=tuple(fine(replace(default, refinement=k)) for k in (1, 2, 3)),
+        cell_sizes=(1, 1 / 2, 1 / 3),
+        with_fine_steps=fine,
+    )
+
+
+def _deformable_block() -> Knobs:
+    from m3gn_bench.generators.deformable_block import DeformableBlock
+
+    levels = DeformableBlock.fidelities
+    default, reference = levels["default"], levels["reference"]
+
+    def times(factor: int) -> Any:
+        return replace(
+            default,
+            hidden_steps=factor,
+            steps=factor,
+            transient_steps=tuple(factor * steps for steps in default.transient_steps),
+        )
+
+    def fine(level: Any) -> Any:
+        return replace(reference, cells=level.cells, element=level.element)
+
+    return Knobs(
+        draws=(0, 1, 2),  # the three second ratios
+        first=0,
+        last=38,
+        frames=39,
+        size=None,
+        settings=(
+            *_fidelities(DeformableBlock),
+            Setting("time step", "1 per frame", replace(default, transient_steps=())),
+            Setting("time step", "4, 2, 2, then 1", replace(default, transient_steps=(4, 2, 2))),
+            Setting("time step", "half the default's", times(2)),
+            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-7)),
+            Setting("mesh", "16 x 16", replace(default, cells=16)),
+            *(
+                Setting(
+                    "element", f"{element}, {cells} x {cells}", replace(default, element=element, cells=cells)
+                )
+                for element, cells in (
+                    ("linear triangles", 8),
+                    ("linear triangles", 16),
+                    ("linear triangles", 32),
+                    ("bilinear", 8),
+                    ("bilinear", 16),
+                    ("biquadratic", 8),
+                )
+            ),
+        ),
+        meshes=tuple(replace(reference, cells=cells) for cells in (8, 16, 32)),
+        cell_sizes=(1, 1 / 2, 1 / 4),
+        with_fine_steps=fine,
+    )
+
+
+def _tissue_manipulation() -> Knobs:
+    from m3gn_bench.generators.tissue_manipulation import TissueManipulation
+
+    default = TissueManipulation.fidelities["default"]
+
+    def fine(level: Any) -> Any:
+        return replace(level, tolerance=1e-7)
+
+    def cells(*numbers: int) -> str:
+        return " x ".join(map(str, numbers))
+
+    return Knobs(
+        draws=(0, 1, 2),  # the three materials
+        first=1,
+        last=100,
+        frames=101,
+        size=None,
+        settings=(
+            *_fidelities(TissueManipulation),
+            Setting("time step", "half the default's", replace(default, steps=2)),
+            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-4)),
+            *(
+                Setting("mesh", cells(*numbers), replace(default, cells=numbers))
+                for numbers in ((6, 1, 8), (6, 1, 24), (6, 1, 32), (12, 1, 16), (12, 1, 32))
+            ),
+            *(
+                Setting(
+                    "element",
+                    f"trilinear, {cells(*numbers)}",
+                    replace(default, element="trilinear", cells=numbers),
+                )
+                for numbers in ((6, 1, 16), (12, 2, 32))
+            ),
+        ),
+        meshes=tuple(fine(replace(default, cells=(6 * k, 2, 16 * k))) for k in (1, 2, 3)),
+        cell_sizes=(1, 1 / 2, 1 / 3),
+        with_fine_steps=fine,
+    )
+
+
+def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
+    from m3gn_bench.generators.falling import SIZE
+
+    default = scene.fidelities["default"]
+
+    def fine(level: Any) -> Any:
+        # About the same step on every mesh: cutting an edge in half halves the stable step.
+        return replace(level, courant=0.175 * 2**level.refinements)
+
+    def sweeps(iterations: int, substeps: int) -> Setting:
+        level = replace(default, vbd_iterations=iterations, vbd_substeps=substeps, nodal_pressure=False)
+        label = f"newton-vbd, {iterations} x {substeps}"
+        return Setting("solver", label, level, {"solver": "newton-vbd"})
+
+    return Knobs(
+        draws=draws,
+        first=33,  # from the impact on, 0.2 s: later motion is chaotic
+        last=52,
+        frames=53,
+        size=SIZE,
+        settings=(
+            *_fidelities(scene),
+            *(
+                Setting("time step", f"{c:g} of the limit", replace(default, courant=c))
+                for c in (0.35, 0.175)
+            ),
+            Setting("mesh", "each tetrahedron in eight", replace(default, refinements=1)),
+            Setting("element", "without nodal pressure", replace(default, nodal_pressure=False)),
+            *(sweeps(*numbers) for numbers in ((10, 10), (2, 40), (2, 80))),
+        ),
+        meshes=tuple(fine(replace(default, refinements=k)) for k in (0, 1, 2)),
+        cell_sizes=(1, 1 / 2, 1 / 4),
+        with_fine_steps=fine,
+        full_length=lambda setting: setting.knob != "solver" and setting.level.refinements == 0,
+    )
+
+
+def _falling_teddy() -> Knobs:
+    from m3gn_bench.generators.falling import FallingTeddy
+
+    return _falling(FallingTeddy, (0, 1, 2))
+
+
+def _mixed_objects() -> Knobs:
+    from m3gn_bench.generators.falling import MixedObjects
+
+    return _falling(MixedObjects, (1, 5))  # bunny and cone
+
+
+_KNOBS: dict[str, Callable[[], Knobs]] = {
+    "sheet_deformation": _sheet_deformation,
+    "deformable_block": _deformable_block,
+    "tissue_manipulation": _tissue_manipulation,
+    "falling_teddy": _falling_teddy,
+    "mixed_objects": _mixed_objects,
+}
+
+
+def knobs_of(scene: str) -> Knobs:
+    """The knobs of a scene. Raises GeneratorError if there is no such scene."""
+    if scene not in _KNOBS:
+        raise GeneratorError(unknown_name("scene", scene, list(_KNOBS)))
+    return _KNOBS[scene]()

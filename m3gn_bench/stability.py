@@ -1,0 +1,309 @@
+"""Numerical stability at the extremes, of simulators and of learned models.
+
+Each simulator cell (see `generators.extremes`) is *correct*, with its error against a finer simulation; *refused*,
+by the solver or the scene's checks, with the frame, the quantity and a remedy; or *wrong*: too far from the finer
+simulation, or not finite. Each model cell gives a model what it was not trained for; its prediction is *bounded*,
+or *wrong*: not finite, or further from the anchor than `MODEL_BOUND` times the scene's size.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from m3gn_bench.checkpoint import load_checkpoint, read_description
+from m3gn_bench.cpu import use_cpu
+from m3gn_bench.data import Body, Case, Context, case_from
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
+from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
+from m3gn_bench.tasks import Task
+
+if TYPE_CHECKING:
+    import torch
+
+    from m3gn_bench.generators.extremes import Extreme, Extremes
+
+MODEL_BOUND = 10.0  # scaled units, in which a scene is two wide
+REASONED = re.compile(r"frame -?\d+.*: .+; .+")  # frame, quantity, remedy
+
+Verdict = Literal["correct", "refused", "bounded", "wrong"]
+
+
+class Judged(Record):
+    """A cell and its verdict.
+
+    Attributes:
+        subject: "simulator", or the model's name.
+        cell: what is extreme about it.
+        verdict: see the module.
+        error: of a simulator against the finer simulation, of a model against the simulator; relative to the
+            displacement or to the object's size (simulators), to the displacement after the anchor (models).
+        detail: why it was refused, or is wrong; for models what was measured.
+    """
+
+    subject: str
+    cell: str
+    verdict: Verdict
+    error: float | None = None
+    detail: str = ""
+
+
+class Stability(Record):
+    """The grid of a task.
+
+    Attributes:
+        allowed: largest error of a correct simulation.
+        cells: simulators first.
+    """
+
+    task: str
+    scene: str
+    dataset_version: str
+    package_version: str
+    machine: str
+    allowed: float
+    unit: str
+    cells: tuple[Judged, ...]
+
+    @property
+    def wrong(self) -> list[Judged]:
+        """Cells that should not be."""
+        return [cell for cell in self.cells if cell.verdict == "wrong"]
+
+
+def measure(
+    task: Task,
+    checkpoints: Sequence[Shipped],
+    state: Path,
+    *,
+    extremes: "Extremes | None" = None,
+    on_progress: OnProgress = lambda done, total: None,
+) -> tuple[Stability, Study]:
+    """Judge every cell of a task; call `finish` of the study that is returned once the result is kept.
+
+    Args:
+        task: which one.
+        checkpoints: trained models of that task.
+        state: folder for results so far; an interrupted run goes on from there.
+        extremes: another grid than the scene's own.
+        on_progress: called with the numbers of cells done and in total.
+    """
+    from m3gn_bench.generators.extremes import extremes_of
+    from m3gn_bench.generators.generate import machine
+    from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.version import __version__
+
+    scene = get_scene(task.scene)
+    grid = extremes or extremes_of(task.scene)
+    study = Study(
+        state,
+        {
+            "task": task.name,
+            "dataset_version": scene.dataset_version,
+            "cells": [repr(cell) for cell in grid.cells],
+            "checkpoints": [read_description(one.folder).weights_sha256 for one in checkpoints],
+        },
+    )
+    cells = [
+        Cell(f"simulator: {one.name}", lambda one=one: _as_result(judge(task.scene, one, grid)))  # type: ignore[misc]
+        for one in grid.cells
+    ]
+    cells += [
+        Cell(f"{one.folder.name}: {name}", lambda o=one, n=name: _as_result(judge_model(task, o, n)))  # type: ignore[misc]
+        for one in checkpoints
+        for name in MODEL_CELLS
+    ]
+    use_cpu(1)
+    with threadpool_limits(1):
+        results = study.measure(cells, on_progress)
+    return Stability(
+        task=task.name,
+        scene=scene.name,
+        dataset_version=scene.dataset_version,
+        package_version=__version__,
+        machine=machine(),
+        allowed=grid.allowed,
+        unit="displacement" if grid.size is None else "size of the object",
+        cells=tuple(
+            Judged.model_validate({k: v for k, v in results[cell.name].values.items() if k != "key"})
+            for cell in cells
+        ),
+    ), study
+
+
+def _as_result(judged: Judged) -> Result:
+    return Result(judged.model_dump())
+
+
+# -- simulators --------------------------------------------------------------------------------------------
+
+
+def judge(scene_name: str, cell: "Extreme", grid: "Extremes") -> Judged:
+    """Simulate a cell and, unless it is refused, the same on the finer mesh."""
+    from m3gn_bench.generators.scene import get_scene
+
+    def judged(verdict: Verdict, error: float | None = None, detail: str = "") -> Judged:
+        return Judged(subject="simulator", cell=cell.name, verdict=verdict, error=error, detail=detail)
+
+    def refused(reason: str) -> Judged:
+        if REASONED.fullmatch(reason):
+            return judged("refused", detail=reason)
+        return judged("wrong", detail=f"refused without frame, quantity or remedy: {reason}")
+
+    scene = get_scene(scene_name, **cell.options)
+    try:
+        trajectory = scene.simulate_with(cell.parameters, cell.level, cell.frames)
+    except ValueError as error:  # of a parameter, before the first step
+        return refused(f"frame 0: {error}; choose one that is allowed")
+    except BenchError as error:
+        reason = str(error)
+        return refused(reason if reason.startswith("frame") else f"frame 0: {reason}")
+    problems = scene.check(trajectory)
+    if problems:
+        return refused(problems[0])
+    fine = {k: v for k, v in cell.options.items() if k != "solver"}
+    try:
+        reference = get_scene(scene_name, **fine).simulate_with(
+            cell.parameters, cell.reference, cell.last + 1
+        )
+    except BenchError as error:
+        return judged("wrong", detail=f"valid, but not on the finer mesh: {error}")
+    window = slice(cell.first, cell.last + 1)
+    found, truth = trajectory.positions[window], reference.positions[window]
+    unit = distance(truth, reference.mesh.rest_positions) if grid.size is None else grid.size
+    apart = distance(found, truth)
+    error_found = apart / unit if apart else 0.0  # nothing moves where forces cancel
+    # A comparison with NaN is false, so it counts as wrong.
+    correct = error_found <= grid.allowed
+    return judged(
+        "correct" if correct else "wrong", error_found, "" if correct else "far from the finer mesh"
+    )
+
+
+# -- models ------------------------------------------------------------------------------------------------
+
+
+def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
+    """Let a model predict under one extreme condition."""
+    import torch
+
+    model, _ = load_checkpoint(checkpoint.folder)
+    with torch.inference_mode():
+        predicted, anchor, truth, detail = MODEL_CELLS[name](task, model)
+    furthest = float((predicted - anchor).abs().max())
+    error = None
+    if truth is not None:
+        moved = distance(truth.numpy(), anchor.expand_as(truth).numpy())
+        error = distance(predicted.numpy(), truth.numpy()) / moved if moved else None
+    bounded = furthest <= MODEL_BOUND
+    return Judged(
+        subject=checkpoint.name,
+        cell=name,
+        verdict="bounded" if bounded else "wrong",
+        error=error if error is not None and np.isfinite(error) else None,
+        detail=f"at most {furthest:.3g} from the anchor" + (f"; {detail}" if detail else ""),
+    )
+
+
+Outcome = "tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, str]"
+
+
+def _case(task: Task, **changes: Any) -> Case:
+    """The first test trajectory, with other parameters of the simulation."""
+    from m3gn_bench.generators.generate import draw
+    from m3gn_bench.generators.scene import get_scene
+
+    scene = get_scene(task.scene)
+    parameters = replace(draw(scene, "test", 0, DATASET_SEED), **changes)  # type: ignore[type-var]
+    return case_from(task, scene, scene.simulate(parameters), trajectory_key("test", 0))
+
+
+def _middle(task: Task) -> int:
+    return task.context_sizes[len(task.context_sizes) // 2]
+
+
+def _usual(task: Task, model: Any, size: int) -> Outcome:  # type: ignore[valid-type]
+    case = _case(task)
+    context = case.context(size)
+    return model.predict(context), context.positions[-1], case.future(size), ""
+
+
+def _longer(factor: int, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
+    """Far past the horizon that it was trained on; the collider stays where it ends."""
+    import torch
+
+    case = _case(task)
+    size = _middle(task)
+    frames = factor * task.frames
+    stays = case.collider_path[-1:].expand(frames - task.frames, -1, -1)
+    path = torch.cat([case.collider_path, stays])
+    context = Context(case.body, case.positions[:size], frames - size, path)
+    predicted = model.predict(context)
+    return predicted, context.positions[-1], None, f"{len(predicted)} frames instead of {task.frames - size}"
+
+
+def _changed(factor: float, shift: float, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
+    """All positions scaled and shifted; predictions are scaled and shifted back."""
+    case = _case(task)
+
+    def change(positions: "torch.Tensor") -> "torch.Tensor":
+        return positions * factor + shift
+
+    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
+    body = Body(**{**values, "rest_positions": change(case.body.rest_positions)})
+    other = Case(body, change(case.positions), change(case.collider_path), case.keys)
+    size = _middle(task)
+    context = other.context(size)
+    predicted = (model.predict(context) - shift) / factor
+    return predicted, (context.positions[-1] - shift) / factor, case.future(size), ""
+
+
+def _material(end: int, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
+    """A simulation with the softest (0) or the stiffest (1) of the scene's materials."""
+    from m3gn_bench.generators.generate import draw
+    from m3gn_bench.generators.scene import get_scene
+
+    scene = get_scene(task.scene)
+    parameters = scene.extreme_materials(draw(scene, "test", 0, DATASET_SEED))[end]
+    case = case_from(task, scene, scene.simulate(parameters), trajectory_key("test", 0))
+    size = _middle(task)
+    context = case.context(size)
+    return model.predict(context), context.positions[-1], case.future(size), ""
+
+
+def _double(task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
+    """The same in double precision: how much is round-off."""
+    case = _case(task)
+    size = _middle(task)
+    single = model.predict(case.context(size))
+    double = model.double()
+    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
+    body = Body(**{n: v.double() if hasattr(v, "is_floating_point") and v.is_floating_point() else v
+                   for n, v in values.items()})  # fmt: skip
+    precise = Case(body, case.positions.double(), case.collider_path.double(), case.keys).context(size)
+    predicted = double.predict(precise)
+    difference = float((predicted - single).abs().max())
+    return (
+        predicted,
+        precise.positions[-1],
+        case.future(size),
+        f"single precision differs by {difference:.1e}",
+    )
+
+
+MODEL_CELLS: dict[str, Callable[..., Any]] = {
+    "context of two frames": lambda task, model: _usual(task, model, 2),
+    "context of all frames but one": lambda task, model: _usual(task, model, task.frames - 1),
+    "four times the horizon": lambda task, model: _longer(4, task, model),
+    "a tenth of the size": lambda task, model: _changed(0.1, 0.0, task, model),
+    "ten times the size": lambda task, model: _changed(10.0, 0.0, task, model),
+    "shifted by ten": lambda task, model: _changed(1.0, 10.0, task, model),
+    "softest material": lambda task, model: _material(0, task, model),
+    "stiffest material": lambda task, model: _material(1, task, model),
+    "double precision": _double,
+}

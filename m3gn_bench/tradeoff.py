@@ -1,0 +1,424 @@
+"""Speed against accuracy: every way to get a trajectory of a task, in one run on one machine.
+
+All are judged by one reference, the finest of three meshes (see `generators.knobs`): simulators at every setting
+of every knob, and learned models at every context size. A model is given the context that the benchmark's dataset
+has, so the error of that data stands beside the model's own.
+
+The error of a trajectory is the root mean square distance of its nodes from the reference over a window of
+frames, divided by the root mean square displacement of the reference from rest or by the object's size. For a
+model only the window's frames after the anchor count. Times are CPU seconds of one thread for a whole trajectory.
+"""
+
+import math
+import platform
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import brentq
+from threadpoolctl import threadpool_limits
+
+from m3gn_bench.checkpoint import load_checkpoint, read_description
+from m3gn_bench.cpu import use_cpu
+from m3gn_bench.data import case_from
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
+from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
+from m3gn_bench.tasks import Task
+
+if TYPE_CHECKING:
+    from m3gn_bench.generators.knobs import Knobs, Setting
+    from m3gn_bench.generators.scene import Scene
+
+REPETITIONS = 5  # of a model's prediction
+# Times of the same work differ by this much from run to run, and errors of the same size from draw to draw: closer
+# ones count as equal.
+TIME_MARGIN, ERROR_MARGIN = 1.1, 1.01
+
+
+class Simulated(Record):
+    """One simulator setting; errors are means over the draws that were not refused.
+
+    Attributes:
+        knob, label: which setting.
+        seconds: of CPU time per trajectory.
+        error: distance from the reference.
+        error_of_steps: distance from the same mesh with fine steps.
+        error_of_mesh: distance of that from the reference.
+        refused: reasons, one for every draw that the scene's checks or the solver refused.
+        on_front: no other way is clearly both faster and more accurate (see `pareto_front`).
+    """
+
+    knob: str
+    label: str
+    seconds: float
+    error: float | None
+    error_of_steps: float | None
+    error_of_mesh: float | None
+    refused: tuple[str, ...] = ()
+    on_front: bool = False
+
+
+class Predicted(Record):
+    """One learned model at one context size.
+
+    Attributes:
+        seconds: per trajectory predicted by itself, context encoding included.
+        error: distance from the reference.
+        error_to_data: distance from the dataset's trajectory, the default fidelity's.
+        error_of_data: distance of that from the reference, over the same frames.
+        training_seconds: CPU seconds of training.
+        rival: the fastest simulator setting that is at least as accurate, if there is one.
+        pays_off_after: number of trajectories after which training has paid for itself against the rival;
+            None: never, because the rival is faster or there is none.
+        pays_off_with_data: the same if simulating the training data counts, too.
+    """
+
+    model: str
+    preset: str
+    context: int
+    seconds: float
+    error: float
+    error_to_data: float
+    error_of_data: float
+    training_seconds: float
+    rival: str | None = None
+    pays_off_after: int | None = None
+    pays_off_with_data: int | None = None
+    on_front: bool = False
+
+
+class Convergence(Record):
+    """What three meshes say of the finest, which is the reference.
+
+    Attributes:
+        levels: the meshes' discretisations.
+        cell_sizes: relative to the coarsest.
+        distances: between the first and second, and between the second and third.
+        order: p of an error C h^p that explains the distances; None if none does.
+        remaining: the reference's own error that follows.
+    """
+
+    levels: tuple[str, ...]
+    cell_sizes: tuple[float, ...]
+    distances: tuple[float, float]
+    order: float | None
+    remaining: float | None
+
+
+class TradeOff(Record):
+    """The whole study of a task."""
+
+    task: str
+    scene: str
+    dataset_version: str
+    package_version: str
+    machine: str
+    draws: tuple[str, ...]
+    window: tuple[int, int]
+    unit: str
+    convergence: Convergence
+    simulators: tuple[Simulated, ...]
+    models: tuple[Predicted, ...]
+
+
+def measure(
+    task: Task,
+    checkpoints: Sequence[Shipped],
+    state: Path,
+    *,
+    knobs: "Knobs | None" = None,
+    on_progress: OnProgress = lambda done, total: None,
+) -> tuple[TradeOff, Study]:
+    """Measure a task's trade-off; call `finish` of the study that is returned once the result is kept.
+
+    Args:
+        task: which one.
+        checkpoints: trained models of that task.
+        state: folder for results so far; an interrupted run goes on from there.
+        knobs: other settings and draws than the scene's own.
+        on_progress: called with the numbers of measurements done and in total.
+    """
+    from m3gn_bench.generators.knobs import knobs_of
+    from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.version import __version__
+
+    scene = get_scene(task.scene)
+    knobs = knobs or knobs_of(task.scene)
+    shipped = [(one, read_description(one.folder)) for one in checkpoints]
+    study = Study(
+        state,
+        {
+            "task": task.name,
+            "dataset_version": scene.dataset_version,
+            "knobs": repr([knobs.draws, knobs.frames, knobs.settings, knobs.meshes]),
+            "checkpoints": [description.weights_sha256 for _, description in shipped],
+            "machine": platform.processor() or platform.machine(),
+        },
+    )
+    use_cpu(1)
+    bench = _Bench(task, scene, knobs)
+    with threadpool_limits(1):
+        results = study.measure(bench.cells([one for one, _ in shipped]), on_progress)
+    simulators = bench.simulators(results)
+    default = next(s for s in simulators if (s.knob, s.label) == ("fidelity", "default"))
+    data_seconds = default.seconds * sum(scene.paper_sizes[s] for s in ("train", "validation"))
+    models = [
+        _pay_off(bench.predicted(results, one, context, 60 * description.minutes), simulators, data_seconds)
+        for one, description in shipped
+        for context in task.context_sizes
+    ]
+    ways = [*simulators, *models]
+    front = pareto_front([(way.seconds, math.inf if way.error is None else way.error) for way in ways])
+    marked = [way.model_copy(update={"on_front": on}) for way, on in zip(ways, front, strict=True)]
+    return TradeOff(
+        task=task.name,
+        scene=scene.name,
+        dataset_version=scene.dataset_version,
+        package_version=__version__,
+        machine=bench.machine,
+        draws=tuple(trajectory_key("test", index) for index in knobs.draws),
+        window=(knobs.first, knobs.last),
+        unit="displacement" if knobs.size is None else "size of the object",
+        convergence=bench.convergence(results),
+        simulators=tuple(way for way in marked if isinstance(way, Simulated)),
+        models=tuple(way for way in marked if isinstance(way, Predicted)),
+    ), study
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Which (seconds, error) no other beats in both by more than the margins within which they count as equal."""
+
+    def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
+        return one[0] * TIME_MARGIN < other[0] and one[1] * ERROR_MARGIN < other[1]
+
+    return [math.isfinite(p[1]) and not any(beats(other, p) for other in points) for p in points]
+
+
+def observed_order(cell_sizes: Sequence[float], distances: tuple[float, float]) -> float | None:
+    """p with distances[k] = C (cell_sizes[k]^p - cell_sizes[k + 1]^p), between 0.1 and 10; None if there is none."""
+    coarse, middle, fine = cell_sizes
+
+    def mismatch(order: float) -> float:
+        expected = (coarse**order - middle**order) / (middle**order - fine**order)
+        return expected - distances[0] / distances[1]
+
+    if min(distances) <= 0 or mismatch(0.1) * mismatch(10.0) > 0:
+        return None
+    return float(brentq(mismatch, 0.1, 10.0))
+
+
+def _pay_off(model: Predicted, simulators: Sequence[Simulated], data_seconds: float) -> Predicted:
+    """After how many trajectories the model has cost less than the fastest simulator that is as accurate."""
+    rivals = [s for s in simulators if s.error is not None and s.error <= model.error and not s.refused]
+    if not rivals:
+        return model
+    rival = min(rivals, key=lambda s: s.seconds)
+    found: dict[str, Any] = {"rival": f"{rival.knob}: {rival.label}"}
+    saved = rival.seconds - model.seconds
+    if saved > 0:
+        found["pays_off_after"] = math.ceil(model.training_seconds / saved)
+        found["pays_off_with_data"] = math.ceil((model.training_seconds + data_seconds) / saved)
+    return model.model_copy(update=found)
+
+
+class _Bench:
+    """The measurements of one task and what follows from them."""
+
+    def __init__(self, task: Task, scene: "Scene", knobs: "Knobs") -> None:
+        from m3gn_bench.generators.generate import draw, machine
+
+        self.task, self.scene, self.knobs = task, scene, knobs
+        self.machine = machine()
+        self.parameters = {i: draw(scene, "test", i, DATASET_SEED) for i in knobs.draws}
+
+    # -- measuring -------------------------------------------------------------------------------------
+
+    def cells(self, shipped: Sequence[Shipped]) -> list[Cell]:
+        """Cheap ones first, so that a mistake shows early."""
+        cells = [
+            Cell(f"{setting.name} {i}", lambda s=setting, i=i: self._timed(s, i))  # type: ignore[misc]
+            for setting in self.knobs.settings
+            for i in self.knobs.draws
+        ]
+        cells += [
+            Cell(f"{one.folder} {context} {i}", lambda o=one, c=context, i=i: self._predict(o, c, i))  # type: ignore[misc]
+            for one in shipped
+            for context in self.task.context_sizes
+            for i in self.knobs.draws
+        ]
+        # Levels that are run for comparison only; several settings share a companion.
+        compared = dict.fromkeys(
+            [*(self._companion(s) for s in self.knobs.settings if not s.options), *self.knobs.meshes]
+        )
+        cells += [
+            Cell(_quiet_name(level, i), lambda v=level, i=i: self._quiet(v, i))  # type: ignore[misc]
+            for level in compared
+            for i in self.knobs.draws
+        ]
+        return cells
+
+    def _companion(self, setting: "Setting") -> Any:
+        return self.knobs.with_fine_steps(setting.level)
+
+    def _timed(self, setting: "Setting", index: int) -> Result:
+        """CPU seconds of a whole trajectory, and its nodes in the window; or why it is refused."""
+        from m3gn_bench.generators.scene import get_scene
+
+        scene = get_scene(self.task.scene, **setting.options)
+        full = self.knobs.full_length(setting)
+        try:
+            seconds, trajectory = self._run(scene, setting.level, index, None if full else self.knobs.frames)
+            if not full:  # setting up costs once, frames cost each
+                short = self.knobs.first + 1
+                start, _ = self._run(scene, setting.level, index, short)
+                each = (seconds - start) / (self.knobs.frames - short)
+                seconds = start + each * (scene.frames - short)
+        except (BenchError, ValueError) as error:
+            return Result({"refused": str(error), "seconds": None})
+        problems = scene.check(trajectory)
+        return Result(
+            {"refused": "; ".join(problems) or None, "seconds": seconds},
+            {"positions": self._window(trajectory.positions), "rest": trajectory.mesh.rest_positions},
+        )
+
+    def _run(self, scene: "Scene", level: Any, index: int, frames: int | None) -> tuple[float, Any]:
+        scene.simulate_with(
+            self.parameters[index], level, self.knobs.first + 2
+        )  # makes meshes, loads libraries
+        start = time.process_time()
+        trajectory = scene.simulate_with(self.parameters[index], level, frames)
+        return time.process_time() - start, trajectory
+
+    def _quiet(self, level: Any, index: int) -> Result:
+        """Nodes in the window, untimed."""
+        trajectory = self.scene.simulate_with(self.parameters[index], level, self.knobs.frames)
+        return Result({}, {"positions": self._window(trajectory.positions)})
+
+    def _window(self, positions: np.ndarray) -> np.ndarray:
+        return positions[self.knobs.first : self.knobs.last + 1]
+
+    def _predict(self, one: Shipped, context: int, index: int) -> Result:
+        """CPU seconds of a prediction from the dataset's context, and its nodes in all frames after the anchor."""
+        import torch
+
+        model, _ = load_checkpoint(one.folder)
+        data = self.scene.simulate(self.parameters[index], "default")
+        case = case_from(self.task, self.scene, data, trajectory_key("test", index))
+        seen = case.context(context)
+        seconds = []
+        with torch.inference_mode():
+            model.predict(seen)
+            for _ in range(REPETITIONS):
+                start = time.process_time()
+                predicted = model.predict(seen)
+                seconds.append(time.process_time() - start)
+        positions = predicted.double().numpy() * self.scene.scale_length + np.array(self.scene.scale_centre)
+        return Result(
+            {"seconds": float(np.median(seconds))}, {"positions": positions, "data": data.positions[context:]}
+        )
+
+    # -- what follows ----------------------------------------------------------------------------------
+
+    def _reference(self, results: dict[str, Result], index: int, level: int = -1) -> np.ndarray:
+        return results[_quiet_name(self.knobs.meshes[level], index)].arrays["positions"]
+
+    def _unit(self, results: dict[str, Result], index: int, first: int) -> float:
+        if self.knobs.size is not None:
+            return self.knobs.size
+        rest = results[f"fidelity: default {index}"].arrays["rest"]
+        return distance(self._reference(results, index)[first - self.knobs.first :], rest)
+
+    def simulators(self, results: dict[str, Result]) -> list[Simulated]:
+        """Means over draws of every setting."""
+        found = []
+        for setting in self.knobs.settings:
+            made = {i: results[f"{setting.name} {i}"] for i in self.knobs.draws}
+            good = [i for i, result in made.items() if result.values["refused"] is None]
+            timed = [r.values["seconds"] for r in made.values() if r.values["seconds"] is not None]
+            errors = np.array([self._split(results, setting, i, made[i]) for i in good]).reshape(-1, 3)
+            total, steps, mesh = errors.mean(0).tolist() if good else (None, None, None)
+            found.append(
+                Simulated(
+                    knob=setting.knob,
+                    label=setting.label,
+                    seconds=float(np.mean(timed)) if timed else math.inf,
+                    error=total,
+                    error_of_steps=None if setting.options else steps,
+                    error_of_mesh=None if setting.options else mesh,
+                    refused=tuple(r.values["refused"] for r in made.values() if r.values["refused"]),
+                )
+            )
+        return found
+
+    def _split(
+        self, results: dict[str, Result], setting: "Setting", index: int, made: Result
+    ) -> tuple[float, float, float]:
+        """Error, and its parts by steps and by mesh (no parts for another solver, which has no companion)."""
+        unit, reference = self._unit(results, index, self.knobs.first), self._reference(results, index)
+        positions = made.arrays["positions"]
+        total = distance(positions, reference) / unit
+        if setting.options:
+            return total, math.nan, math.nan
+        companion = results[_quiet_name(self._companion(setting), index)].arrays["positions"]
+        return total, distance(positions, companion) / unit, distance(companion, reference) / unit
+
+    def predicted(
+        self, results: dict[str, Result], one: Shipped, context: int, training_seconds: float
+    ) -> Predicted:
+        """Means over draws of a model at a context size."""
+        first = max(context, self.knobs.first)
+        errors, seconds = [], []
+        for i in self.knobs.draws:
+            result = results[f"{one.folder} {context} {i}"]
+            window = slice(first - context, self.knobs.last + 1 - context)
+            positions, data = (result.arrays[name][window] for name in ("positions", "data"))
+            truth = self._reference(results, i)[first - self.knobs.first :]
+            unit = self._unit(results, i, first)
+            errors.append(
+                [distance(a, b) / unit for a, b in ((positions, truth), (positions, data), (data, truth))]
+            )
+            seconds.append(result.values["seconds"])
+        error, to_data, of_data = np.mean(errors, axis=0).tolist()
+        return Predicted(
+            model=one.name,
+            preset=one.preset,
+            context=context,
+            seconds=float(np.mean(seconds)),
+            error=error,
+            error_to_data=to_data,
+            error_of_data=of_data,
+            training_seconds=training_seconds,
+        )
+
+    def convergence(self, results: dict[str, Result]) -> Convergence:
+        """Means over draws of the distances between the three meshes."""
+        pairs = ((0, 1), (1, 2))
+        distances = [
+            np.mean(
+                [
+                    distance(self._reference(results, i, a), self._reference(results, i, b))
+                    / self._unit(results, i, self.knobs.first)
+                    for i in self.knobs.draws
+                ]
+            )
+            for a, b in pairs
+        ]
+        sizes = self.knobs.cell_sizes
+        order = observed_order(sizes, (distances[0], distances[1]))
+        remaining = None
+        if order is not None:
+            remaining = float(distances[1] * sizes[2] ** order / (sizes[1] ** order - sizes[2] ** order))
+        return Convergence(
+            levels=tuple(map(repr, self.knobs.meshes)),
+            cell_sizes=sizes,
+            distances=(float(distances[0]), float(distances[1])),
+            order=order,
+            remaining=remaining,
+        )
+
+
+def _quiet_name(level: Any, index: int) -> str:
+    return f"{level} {index}"
