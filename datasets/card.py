@@ -102,13 +102,13 @@ def numbers(path: Path, further: Sequence[tuple[str, str]] = ()) -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
 
 
-def fill(card: str, block: str) -> str:
-    """The card with its block replaced. Raises DatasetError if the card has no such block."""
-    before, begin, rest = card.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise DatasetError(f"the card has no block between {BEGIN!r} and {END!r}")
-    return f"{before}{BEGIN}\n{block}\n{END}{after}"
+def fill(card: str, block: str, begin: str = BEGIN, end: str = END) -> str:
+    """The card with the block between two markers replaced. Raises DatasetError if it has no such block."""
+    before, opened, rest = card.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not opened or not closed:
+        raise DatasetError(f"the card has no block between {begin!r} and {end!r}")
+    return f"{before}{begin}\n{block}\n{end}{after}"
 
 
 def _range(values: list[float], unit: str) -> str:

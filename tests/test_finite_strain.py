@@ -8,7 +8,7 @@ import pytest
 from skfem import ElementHexS2, ElementQuad1, ElementQuadS2, ElementTetP1, Mesh, MeshHex, MeshQuad, MeshTet
 
 from m3gn_bench.generators.errors import SolverError
-from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, Floor, PenaltyContact
+from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, PenaltyContact
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Response, Setting, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
@@ -73,12 +73,22 @@ def potential_of(
     return IncrementalPotential(body, law_for(solid, poisson_ratio), contact=contact, force_floor=1e-9 * E)
 
 
+class Floor:
+    """The half-space below 0.2, an obstacle that is flat."""
+
+    def depth(self, points: np.ndarray, time: float) -> np.ndarray:
+        return 0.2 - points[:, -1]
+
+    def normal(self, points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.eye(points.shape[1])[-1] + 0 * points, np.zeros(len(points))
+
+
 def obstacles_around(solid: Solid) -> PenaltyContact:
     """A ball that dents the top, and a floor that the sides hang below."""
     d = solid.dimension
     ball = Disc(radius=0.4, start=(0.45,) * (d - 1) + (1.3,), velocity=(0.0,) * (d - 1) + (-0.1,))
     points = BoundaryPoints(solid, boundary_facets(solid), integration_order=5)
-    return PenaltyContact(points, penalty=3 * E, obstacles=[ball, Floor(0.2)])
+    return PenaltyContact(points, penalty=3 * E, obstacles=[ball, Floor()])
 
 
 # --- the law ----------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from physics_variants import crosses_itself, tissue_outline
 from tissue_cases import CASES, DENSITY, GRAVITY, displacements, draw, march, relative_error
 
-from m3gn_bench.generators.solvers.sparse import Array
 from m3gn_bench.generators.tissue_manipulation import (
     MATERIALS,
     TissueManipulation,
@@ -49,44 +49,14 @@ def test_march_without_changes_is_the_scene() -> None:
     assert np.abs(march(CASES[0]) - displacements(CASES[0])).max() < 2e-4  # the solver's tolerance
 
 
-def _outline(positions: Array) -> Array:
-    """The rim of the wall's front face as a closed polygon in the plane of the wall, shape [vertices, 2]."""
-    recorded = surface()
-    across, y, z = recorded.coordinates.T
-    front = np.isclose(y, y.min())
-    rim = []
-    for there, key in ((np.isclose(across, 0), z), (np.isclose(z, z.max()), across),
-                       (np.isclose(across, 1), -z), (np.isclose(z, 0), -across)):  # fmt: skip
-        side = np.flatnonzero(front & there)
-        rim += side[np.argsort(key[side])][:-1].tolist()
-    return positions[rim][:, [0, 2]]
-
-
-def _crosses_itself(polygon: Array) -> bool:
-    """Whether two edges that are no neighbours intersect."""
-    a, b = polygon, np.roll(polygon, -1, axis=0)
-
-    def side(p: Array, q: Array, r: Array) -> Array:
-        return np.sign(
-            (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1])
-            - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
-        )
-
-    i, j = np.triu_indices(len(a), 2)
-    apart = (side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0) & (
-        side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) < 0
-    )
-    return bool(apart.any())
-
-
 def test_tissue_does_not_touch_itself() -> None:
     """Without inverted cells and out-of-plane motion, the front face's rim is where contact would begin."""
     figure_eight = np.array([[0, 0], [1, 1], [1, 0], [0, 1]], dtype=float)
-    assert _crosses_itself(figure_eight)
-    assert not _crosses_itself(_outline(surface().rest_positions))
+    assert crosses_itself(figure_eight)
+    assert not crosses_itself(tissue_outline(surface().rest_positions))
     for index in range(9):
         moved = displacements(draw(index)) + surface().rest_positions
-        assert not any(_crosses_itself(_outline(frame)) for frame in moved)
+        assert not any(crosses_itself(tissue_outline(frame)) for frame in moved)
 
 
 def test_materials_differ() -> None:

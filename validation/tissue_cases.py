@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from sheet_cases import relative_error
 
-from m3gn_bench.generators.solvers.dynamics import ImplicitDynamics, IncrementalPotential
+from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
 from m3gn_bench.generators.solvers.sparse import Array
@@ -17,7 +17,6 @@ from m3gn_bench.generators.tissue_manipulation import (
     RENEWAL_INTERVAL,
     THICKNESS,
     TRANSITIONS,
-    Slab,
     TissueFidelity,
     TissueManipulation,
     TissueParameters,
@@ -71,18 +70,18 @@ class _LoadedPotential(IncrementalPotential):
 
     def __init__(
         self,
-        slab: Slab,
+        body: ConstrainedSolid,
         law: NeoHookean,
         *,
         acceleration: Array,
         stiffness_damping: float,
         force_floor: float,
     ) -> None:
-        super().__init__(slab.body, law, force_floor=force_floor)
-        mass = np.asarray(slab.body.nodal_mass.sum(1)).ravel()
+        super().__init__(body, law, force_floor=force_floor)
+        mass = np.asarray(body.nodal_mass.sum(1)).ravel()
         self.load = DENSITY * np.outer(mass, acceleration).ravel()
         self.viscosity = stiffness_damping / FRAME
-        self.begin_frame(np.zeros(slab.body.solid.dofs))
+        self.begin_frame(np.zeros(body.solid.dofs))
 
     def begin_frame(self, before: Array) -> None:
         """Set the state at the step's beginning, shape [dofs]."""
@@ -116,6 +115,7 @@ def march(
     stiffness_damping: float = 0.0,
     distance: Callable[[float], float] = lambda time: time,
     transitions: int = TRANSITIONS,
+    alter: Callable[[ConstrainedSolid], ConstrainedSolid] = lambda body: body,
 ) -> Array:
     """Displacements of the recorded vertices [mm], shape [transitions + 1, 361, 3], with other physics.
 
@@ -127,8 +127,10 @@ def march(
         stiffness_damping: Rayleigh's coefficient [s]; only with one step per frame.
         distance: the gripper's travel over its speed at a time [s].
         transitions: how many frames to march.
+        alter: makes another body of the slab, with the same unknowns.
     """
     slab = make_slab(parameters.patch, level.cells, level.element)
+    body = alter(slab.body)
     law = NeoHookean.from_youngs_modulus(parameters.youngs_modulus, parameters.poisson_ratio, "3d")
     velocity = parameters.speed * parameters.direction
     floor = 1e-9 * parameters.youngs_modulus * THICKNESS**2
@@ -136,14 +138,14 @@ def march(
     if stiffness_damping or any(acceleration):
         assert level.steps == 1, "the damping knows one step per frame"
         potential = _LoadedPotential(
-            slab,
+            body,
             law,
             acceleration=np.array(acceleration),
             stiffness_damping=stiffness_damping,
             force_floor=floor,
         )
     else:
-        potential = IncrementalPotential(slab.body, law, force_floor=floor)
+        potential = IncrementalPotential(body, law, force_floor=floor)
     newton = ModifiedNewton(potential, tolerance=level.tolerance)
     dynamics = ImplicitDynamics(
         potential,
