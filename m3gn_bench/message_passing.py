@@ -88,7 +88,8 @@ class MessagePassingNetwork(nn.Module):
         )
         for block in others:
             nodes, edges = block(nodes, edges, graph)
-        return self.readout(functional.leaky_relu(self.hidden(nodes))).float()  # also under autocast
+        outputs = self.readout(functional.leaky_relu(self.hidden(nodes)))
+        return outputs.to(graph.node_features.dtype)  # also under autocast
 
 
 def _compose(weight: Tensor, inner: nn.Linear, inputs: Tensor) -> Tensor:

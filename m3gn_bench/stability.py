@@ -8,9 +8,9 @@ or *wrong*: not finite, or further from the anchor than `MODEL_BOUND` times the 
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -188,122 +188,107 @@ def judge(scene_name: str, cell: "Extreme", grid: "Extremes") -> Judged:
 # -- models ------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a model is given, and what it is judged by.
+
+    Attributes:
+        context: as the model sees it.
+        truth: what the simulator says, in usual units; None where it says nothing.
+        factor, shift: from usual units to those that the model sees.
+    """
+
+    context: Context
+    truth: "torch.Tensor | None"
+    factor: float = 1.0
+    shift: float = 0.0
+
+    def usual(self, positions: "torch.Tensor") -> "torch.Tensor":
+        """Positions that the model sees or predicts, in usual units."""
+        return (positions - self.shift) / self.factor
+
+
 def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
     """Let a model predict under one extreme condition."""
     import torch
 
     model, _ = load_checkpoint(checkpoint.folder)
+    given = MODEL_CELLS[name](task)
+    if given.context.positions.dtype == torch.float64:
+        model.double()
     with torch.inference_mode():
-        predicted, anchor, truth, detail = MODEL_CELLS[name](task, model)
+        predicted = given.usual(model.predict(given.context))
+    anchor = given.usual(given.context.positions[-1])
     furthest = float((predicted - anchor).abs().max())
     error = None
-    if truth is not None:
-        moved = distance(truth.numpy(), anchor.expand_as(truth).numpy())
-        error = distance(predicted.numpy(), truth.numpy()) / moved if moved else None
-    bounded = furthest <= MODEL_BOUND
+    if given.truth is not None:
+        moved = distance(given.truth.numpy(), anchor.expand_as(given.truth).numpy())
+        error = distance(predicted.numpy(), given.truth.numpy()) / moved
+    finite = np.isfinite(furthest) and (error is None or np.isfinite(error))
     return Judged(
         subject=checkpoint.name,
         cell=name,
-        verdict="bounded" if bounded else "wrong",
-        error=error if error is not None and np.isfinite(error) else None,
-        detail=f"at most {furthest:.3g} from the anchor" + (f"; {detail}" if detail else ""),
+        verdict="bounded" if finite and furthest <= MODEL_BOUND else "wrong",
+        error=error if finite else None,
+        detail=f"at most {furthest:.3g} from the anchor",
     )
 
 
-Outcome = "tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, str]"
-
-
-def _case(task: Task, **changes: Any) -> Case:
-    """The first test trajectory, with other parameters of the simulation."""
+def _case(task: Task, material: int | None = None) -> Case:
+    """The first test trajectory; or the same with the softest (0) or the stiffest (1) of the scene's materials."""
     from m3gn_bench.generators.generate import draw
     from m3gn_bench.generators.scene import get_scene
 
     scene = get_scene(task.scene)
-    parameters = replace(draw(scene, "test", 0, DATASET_SEED), **changes)  # type: ignore[type-var]
+    parameters = draw(scene, "test", 0, DATASET_SEED)
+    if material is not None:
+        parameters = scene.extreme_materials(parameters)[material]
     return case_from(task, scene, scene.simulate(parameters), trajectory_key("test", 0))
+
+
+def _given(case: Case, size: int, factor: float = 1.0, shift: float = 0.0) -> Given:
+    return Given(_map(case, lambda t: t * factor + shift).context(size), case.future(size), factor, shift)
+
+
+def _map(case: Case, change: "Callable[[torch.Tensor], torch.Tensor]") -> Case:
+    """The same case with all positions changed."""
+    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
+    body = Body(**{**values, "rest_positions": change(case.body.rest_positions)})
+    return Case(body, change(case.positions), change(case.collider_path), case.keys)
 
 
 def _middle(task: Task) -> int:
     return task.context_sizes[len(task.context_sizes) // 2]
 
 
-def _usual(task: Task, model: Any, size: int) -> Outcome:  # type: ignore[valid-type]
-    case = _case(task)
-    context = case.context(size)
-    return model.predict(context), context.positions[-1], case.future(size), ""
-
-
-def _longer(factor: int, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
-    """Far past the horizon that it was trained on; the collider stays where it ends."""
+def _longer(task: Task, factor: int) -> Given:
+    """Far past the horizon that models are trained on; the collider stays where it ends."""
     import torch
 
-    case = _case(task)
-    size = _middle(task)
-    frames = factor * task.frames
+    case, size, frames = _case(task), _middle(task), factor * task.frames
     stays = case.collider_path[-1:].expand(frames - task.frames, -1, -1)
     path = torch.cat([case.collider_path, stays])
-    context = Context(case.body, case.positions[:size], frames - size, path)
-    predicted = model.predict(context)
-    return predicted, context.positions[-1], None, f"{len(predicted)} frames instead of {task.frames - size}"
+    return Given(Context(case.body, case.positions[:size], frames - size, path), None)
 
 
-def _changed(factor: float, shift: float, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
-    """All positions scaled and shifted; predictions are scaled and shifted back."""
-    case = _case(task)
-
-    def change(positions: "torch.Tensor") -> "torch.Tensor":
-        return positions * factor + shift
-
-    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
-    body = Body(**{**values, "rest_positions": change(case.body.rest_positions)})
-    other = Case(body, change(case.positions), change(case.collider_path), case.keys)
-    size = _middle(task)
-    context = other.context(size)
-    predicted = (model.predict(context) - shift) / factor
-    return predicted, (context.positions[-1] - shift) / factor, case.future(size), ""
+def _double(task: Task) -> Given:
+    """Everything in double precision."""
+    case, size = _case(task), _middle(task)
+    precise = _map(case, lambda t: t.double())
+    values = {name: getattr(precise.body, name) for name in Body.__dataclass_fields__}
+    floats = {n: values[n].double() for n in ("static_features", "material")}
+    body = Body(**{**values, **floats})
+    return Given(replace(precise, body=body).context(size), case.future(size))
 
 
-def _material(end: int, task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
-    """A simulation with the softest (0) or the stiffest (1) of the scene's materials."""
-    from m3gn_bench.generators.generate import draw
-    from m3gn_bench.generators.scene import get_scene
-
-    scene = get_scene(task.scene)
-    parameters = scene.extreme_materials(draw(scene, "test", 0, DATASET_SEED))[end]
-    case = case_from(task, scene, scene.simulate(parameters), trajectory_key("test", 0))
-    size = _middle(task)
-    context = case.context(size)
-    return model.predict(context), context.positions[-1], case.future(size), ""
-
-
-def _double(task: Task, model: Any) -> Outcome:  # type: ignore[valid-type]
-    """The same in double precision: how much is round-off."""
-    case = _case(task)
-    size = _middle(task)
-    single = model.predict(case.context(size))
-    double = model.double()
-    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
-    body = Body(**{n: v.double() if hasattr(v, "is_floating_point") and v.is_floating_point() else v
-                   for n, v in values.items()})  # fmt: skip
-    precise = Case(body, case.positions.double(), case.collider_path.double(), case.keys).context(size)
-    predicted = double.predict(precise)
-    difference = float((predicted - single).abs().max())
-    return (
-        predicted,
-        precise.positions[-1],
-        case.future(size),
-        f"single precision differs by {difference:.1e}",
-    )
-
-
-MODEL_CELLS: dict[str, Callable[..., Any]] = {
-    "context of two frames": lambda task, model: _usual(task, model, 2),
-    "context of all frames but one": lambda task, model: _usual(task, model, task.frames - 1),
-    "four times the horizon": lambda task, model: _longer(4, task, model),
-    "a tenth of the size": lambda task, model: _changed(0.1, 0.0, task, model),
-    "ten times the size": lambda task, model: _changed(10.0, 0.0, task, model),
-    "shifted by ten": lambda task, model: _changed(1.0, 10.0, task, model),
-    "softest material": lambda task, model: _material(0, task, model),
-    "stiffest material": lambda task, model: _material(1, task, model),
+MODEL_CELLS: dict[str, Callable[[Task], Given]] = {
+    "context of two frames": lambda task: _given(_case(task), 2),
+    "context of all frames but one": lambda task: _given(_case(task), task.frames - 1),
+    "four times the horizon": lambda task: _longer(task, 4),
+    "a tenth of the size": lambda task: _given(_case(task), _middle(task), factor=0.1),
+    "ten times the size": lambda task: _given(_case(task), _middle(task), factor=10.0),
+    "shifted by ten scenes": lambda task: _given(_case(task), _middle(task), shift=20.0),
+    "softest material": lambda task: _given(_case(task, material=0), _middle(task)),
+    "stiffest material": lambda task: _given(_case(task, material=1), _middle(task)),
     "double precision": _double,
 }

@@ -196,17 +196,25 @@ def draw(study: TradeOff) -> "Figure":
     )
     front = sorted((w.seconds, w.error) for w in _ways(study) if w.on_front and not _refused(w) and w.error)
     axes.plot(*zip(*front, strict=True), color="0.8", linewidth=6, zorder=1, label="front")
+    colours = iter(f"C{n}" for n in range(10))
     for knob in dict.fromkeys(s.knob for s in study.simulators):
         shown = [s for s in study.simulators if s.knob == knob and s.error and not s.refused]
         points = [(s.seconds, s.error) for s in shown]
         if points:
-            axes.scatter(*zip(*points, strict=True), s=36, zorder=3, label=knob)
+            axes.scatter(*zip(*points, strict=True), s=36, zorder=3, label=knob, color=next(colours))
         for s in shown:
             place = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 7}
             axes.annotate(s.label, (s.seconds, s.error or 0.0), **place)  # type: ignore[arg-type]
     for name in dict.fromkeys(m.model for m in study.models):
         ones = [m for m in study.models if m.model == name]
-        axes.plot([m.seconds for m in ones], [m.error for m in ones], marker="^", zorder=3, label=name)
+        axes.plot(
+            [m.seconds for m in ones],
+            [m.error for m in ones],
+            marker="^",
+            zorder=3,
+            label=f"{name}, by context",
+            color=next(colours),
+        )
         for m in ones:
             axes.annotate(
                 f"context {m.context}",

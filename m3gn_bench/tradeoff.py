@@ -159,7 +159,7 @@ def measure(
         },
     )
     use_cpu(1)
-    bench = _Bench(task, scene, knobs)
+    bench = Bench(task, scene, knobs)
     with threadpool_limits(1):
         results = study.measure(bench.cells([one for one, _ in shipped]), on_progress)
     simulators = bench.simulators(results)
@@ -224,7 +224,7 @@ def _pay_off(model: Predicted, simulators: Sequence[Simulated], data_seconds: fl
     return model.model_copy(update=found)
 
 
-class _Bench:
+class Bench:
     """The measurements of one task and what follows from them."""
 
     def __init__(self, task: Task, scene: "Scene", knobs: "Knobs") -> None:

@@ -1,0 +1,288 @@
+"""Studies of speed, accuracy and stability: their bookkeeping, on grids small enough to run here."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from m3gn_bench import stability, tradeoff
+from m3gn_bench.cli import cli
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.generators.deformable_block import DeformableBlock
+from m3gn_bench.generators.extremes import Extreme, Extremes, extremes_of
+from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
+from m3gn_bench.generators.scene import scene_names
+from m3gn_bench.generators.sheet_deformation import SheetDeformation
+from m3gn_bench.leaderboard.record import checkpoint_folder
+from m3gn_bench.stability import MODEL_CELLS, REASONED
+from m3gn_bench.studies import Cell, Result, Shipped, Study
+from m3gn_bench.study_page import draw, read_records, save
+from m3gn_bench.tasks import get_task
+
+TASK = get_task("sheet_deformation")
+M3GN = Shipped("m3gn", "compact", checkpoint_folder(TASK.name, "m3gn", "compact"))
+DEFAULT = SheetDeformation.fidelities["default"]
+SMALL = Knobs(
+    draws=(4,),
+    first=1,
+    last=12,
+    frames=13,
+    size=None,
+    settings=(
+        Setting("fidelity", "default", DEFAULT),
+        Setting("tolerance", "0.1", replace(DEFAULT, tolerance=1e-1)),
+        Setting("mesh", "even", replace(DEFAULT, border_layer=False)),
+    ),
+    meshes=tuple(replace(DEFAULT, refinement=k) for k in (1, 2, 3)),
+    cell_sizes=(1, 1 / 2, 1 / 3),
+    with_fine_steps=lambda level: replace(level, tolerance=1e-7),
+)
+
+
+# -- bookkeeping -------------------------------------------------------------------------------------------
+
+
+def counted(calls: list[str], name: str, fails: bool = False) -> Cell:
+    def measure() -> Result:
+        if fails:
+            raise KeyboardInterrupt
+        calls.append(name)
+        return Result({"name": name}, {"numbers": np.arange(3.0)})
+
+    return Cell(name, measure)
+
+
+def ignore(done: int, total: int) -> None:
+    """No progress bar."""
+
+
+def test_an_interrupted_study_goes_on(tmp_path: Path) -> None:
+    calls: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        Study(tmp_path, {"a": 1}).measure([counted(calls, "one"), counted(calls, "two", fails=True)], ignore)
+    study = Study(tmp_path, {"a": 1})
+    results = study.measure([counted(calls, "one"), counted(calls, "two")], ignore)
+    assert calls == ["one", "two"]
+    assert results["one"].values["name"] == "one"
+    assert np.array_equal(results["one"].arrays["numbers"], [0, 1, 2])
+    study.finish()
+    assert not tmp_path.exists()
+
+
+def test_results_of_other_settings_are_dropped(tmp_path: Path) -> None:
+    calls: list[str] = []
+    for settings in ({"a": 1}, {"a": 2}):
+        Study(tmp_path, settings).measure([counted(calls, "one")], ignore)
+    assert calls == ["one", "one"]
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot write to"):
+        Study(tmp_path / "file" / "study", {})
+
+
+# -- what follows from measurements ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 3.5])
+@pytest.mark.parametrize("sizes", [(1, 1 / 2, 1 / 4), (1, 1 / 2, 1 / 3)])
+def test_observed_order(order: float, sizes: tuple[float, ...]) -> None:
+    errors = [size**order for size in sizes]
+    found = tradeoff.observed_order(sizes, (errors[0] - errors[1], errors[1] - errors[2]))
+    assert found == pytest.approx(order)
+
+
+def test_no_order_where_nothing_converges() -> None:
+    assert tradeoff.observed_order((1, 1 / 2, 1 / 4), (1.0, 2.0)) is None
+    assert tradeoff.observed_order((1, 1 / 2, 1 / 4), (0.0, 0.0)) is None
+
+
+def test_pareto_front() -> None:
+    """Beaten only by what is clearly better in both; what has no error is on no front."""
+    points = [(1.0, 1.0), (2.0, 0.5), (3.0, 0.6), (2.05, 0.505), (0.5, math.inf)]
+    assert tradeoff.pareto_front(points) == [True, True, False, True, False]
+
+
+# -- the grids ---------------------------------------------------------------------------------------------
+
+
+def test_grids_are_large_enough() -> None:
+    """At least 60 cells over the five scenes, and 20 for models; names are unique."""
+    grids = [extremes_of(name) for name in scene_names()]
+    assert sum(len(grid.cells) for grid in grids) >= 60
+    for grid in grids:
+        assert len({cell.name for cell in grid.cells}) == len(grid.cells)
+    shipped = ("m3gn", "mgn", "mgn_material")
+    assert len(shipped) * len(MODEL_CELLS) >= 20
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_knobs_are_sound(name: str) -> None:
+    """The default is among the settings, names are unique, meshes get finer."""
+    knobs = knobs_of(name)
+    names = [setting.name for setting in knobs.settings]
+    assert "fidelity: default" in names
+    assert len(set(names)) == len(names)
+    assert sorted(knobs.cell_sizes, reverse=True) == list(knobs.cell_sizes)
+
+
+BLOCK = next(cell for cell in extremes_of("deformable_block").cells if cell.name == "lowest fidelity")
+FEW = replace(BLOCK, frames=6, last=5, reference=DeformableBlock.fidelities["default"])
+
+
+def judged(cell: Extreme, allowed: float = 0.1) -> stability.Judged:
+    return stability.judge("deformable_block", cell, Extremes((cell,), allowed, None))
+
+
+def test_verdicts() -> None:
+    """A good simulation is correct, a locking element is wrong, the impossible is refused with all reasons."""
+    good = judged(FEW)
+    assert (good.verdict, good.error is not None and good.error < 0.02) == ("correct", True)
+    locking = judged(replace(FEW, level=replace(FEW.level, element="linear triangles")), allowed=0.02)
+    assert locking.verdict == "wrong"
+    for changes in ({"poisson_ratios": (0.0, 0.5)}, {"speed": 0.0}, {"youngs_modulus": -1.0}):
+        refused = judged(replace(FEW, parameters=replace(FEW.parameters, **changes)))
+        assert refused.verdict == "refused"
+        assert REASONED.fullmatch(refused.detail)
+
+
+def test_what_is_not_finite_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where a scene's checks are blind."""
+    simulate = DeformableBlock.simulate_with
+
+    def spoilt(self: DeformableBlock, *arguments: object) -> object:
+        trajectory = simulate(self, *arguments)  # type: ignore[arg-type]
+        trajectory.positions[3] = np.nan
+        return trajectory
+
+    monkeypatch.setattr(DeformableBlock, "simulate_with", spoilt)
+    monkeypatch.setattr(DeformableBlock, "check", lambda self, trajectory: [])
+    assert judged(FEW).verdict == "wrong"
+
+
+def test_a_refusal_without_remedy_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DeformableBlock, "check", lambda self, trajectory: ["it failed"])
+    assert judged(FEW).verdict == "wrong"
+
+
+@pytest.mark.parametrize("name", MODEL_CELLS)
+def test_a_model_at_its_extremes(name: str) -> None:
+    found = stability.judge_model(TASK, M3GN, name)
+    assert found.verdict == "bounded"
+
+
+def test_models_do_not_mind_where_the_scene_is() -> None:
+    usual, shifted, double = (
+        stability.judge_model(TASK, M3GN, name).error
+        for name in ("stiffest material", "shifted by ten scenes", "double precision")
+    )
+    assert usual is not None
+    assert shifted == pytest.approx(double, rel=1e-3)
+
+
+# -- commands ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands measure small grids, and one model."""
+    monkeypatch.setattr("m3gn_bench.generators.knobs.knobs_of", lambda scene: SMALL)
+    impossible = replace(FEW, name="nu = 0.5", parameters=replace(FEW.parameters, poisson_ratios=(0.0, 0.5)))
+    grid = Extremes((FEW, impossible), 0.1, None)
+    monkeypatch.setattr("m3gn_bench.generators.extremes.extremes_of", lambda scene: grid)
+
+
+@pytest.mark.usefixtures("small")
+def test_commands_measure_record_and_render(tmp_path: Path) -> None:
+    """Both studies and the page; then the page is up to date, until a record changes."""
+    docs = tmp_path / "docs"
+
+    def run(*arguments: str) -> tuple[int, dict[str, Any]]:
+        done = CliRunner().invoke(cli, [*arguments, "--json"])
+        return done.exit_code, json.loads(done.stdout)
+
+    places = ["--data", str(tmp_path), "--record", str(docs / "studies")]
+    figure = tmp_path / "figure.png"
+    code, found = run("tradeoff", TASK.name, "-o", str(figure), "--checkpoint", str(M3GN.folder), *places)
+    assert code == 0
+    assert len(found.pop("advice")) == 3
+    assert figure.stat().st_size > 5000
+    (result,), _ = read_records(docs / "studies")
+    assert found == result.model_dump(mode="json")
+    assert_sound(result)
+    code, found = run("stability", "deformable_block", *places)
+    assert (code, found["wrong"]) == (0, 0)
+    assert not list(tmp_path.glob("*.partial"))
+
+    assert run("render-studies", str(docs))[0] == 0
+    assert "m3gn (compact)" in (docs / "tradeoff.md").read_text()
+    assert run("render-studies", str(docs), "--check")[0] == 0
+    record = docs / "studies" / f"tradeoff-{TASK.name}.json"
+    record.write_text(record.read_text().replace("displacement", "size"))
+    assert run("render-studies", str(docs), "--check")[0] == 1
+    with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
+        save(draw(result), tmp_path / "figure.xyz")
+
+
+def assert_sound(result: tradeoff.TradeOff) -> None:
+    """Errors are split into steps and mesh, and a model stands beside them."""
+    default, loose, even = result.simulators
+    assert default.error
+    assert default.error == pytest.approx(
+        default.error_of_mesh, rel=0.05
+    )  # its tolerance leaves nothing open
+    assert even.error
+    assert even.error > 1.5 * default.error  # the clamp's boundary layer
+    assert loose.refused or (loose.error or 0) > default.error
+    convergence = result.convergence
+    assert convergence.order
+    assert convergence.order > 1
+    assert convergence.remaining
+    assert convergence.remaining < default.error
+    assert [model.context for model in result.models] == [2, 5, 10]
+    for model in result.models:
+        assert model.error == pytest.approx(model.error_to_data, rel=0.1)
+        assert model.error > model.error_of_data
+        assert model.pays_off_after
+        assert model.pays_off_with_data
+        assert model.pays_off_after < model.pays_off_with_data
+        rival = next(s for s in result.simulators if f"{s.knob}: {s.label}" == model.rival)
+        assert model.pays_off_after == math.ceil(model.training_seconds / (rival.seconds - model.seconds))
+
+
+@pytest.mark.usefixtures("small")
+def test_a_wrong_cell_is_an_exit_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(DeformableBlock, "check", lambda self, trajectory: ["it failed"])
+    done = CliRunner().invoke(cli, ["stability", "deformable_block", "--data", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "2 cells, 1 wrong" in done.stdout
+
+
+def test_a_damaged_record_is_named(tmp_path: Path) -> None:
+    (tmp_path / f"tradeoff-{TASK.name}.json").write_text("{}")
+    with pytest.raises(ConfigError, match=f"tradeoff-{TASK.name}.json is no record"):
+        read_records(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["tradeoff", "falling_dodo"], "unknown task 'falling_dodo'; known: "),
+        (["stability", "falling_dodo"], "unknown task 'falling_dodo'; known: "),
+        (["tradeoff", "deformable_block", "--checkpoint", "nowhere"], "no checkpoint in nowhere"),
+        (
+            ["tradeoff", "deformable_block", "--checkpoint", str(M3GN.folder)],
+            "was trained on sheet_deformation",
+        ),
+        (["render-studies", "nowhere"], "no records in nowhere"),
+    ],
+)
+def test_mistakes_are_explained(arguments: list[str], message: str) -> None:
+    done = CliRunner().invoke(cli, arguments)
+    assert message in str(done.exception)
