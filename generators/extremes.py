@@ -209,7 +209,10 @@ def _falling_teddy() -> Extremes:
 
     default = FallingTeddy.fidelities["default"]
     single = replace(default, nodal_pressure=False)
-    stiff = {"youngs_modulus": 1e6, "poisson_ratio": 0.499}  # only where steps are short does their limit bind
+    stiff = {
+        "youngs_modulus": 1e6,
+        "poisson_ratio": 0.499,
+    }  # only where steps are short does their limit bind
     return Extremes(
         cells=_falling_cells(
             FallingTeddy,

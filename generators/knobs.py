@@ -238,6 +238,9 @@ def _mixed_objects() -> Knobs:
 
 _KNOBS: dict[str, Callable[[], Knobs]] = {
     "sheet_deformation": _sheet_deformation,
+    "sheet_deformation_ood": lambda: replace(
+        _sheet_deformation(), draws=(0, 1, 8)
+    ),  # E = 10, 30 and 1000 MPa
     "deformable_block": _deformable_block,
     "tissue_manipulation": _tissue_manipulation,
     "falling_teddy": _falling_teddy,
@@ -245,8 +248,8 @@ _KNOBS: dict[str, Callable[[], Knobs]] = {
 }
 
 
-def knobs_of(scene: str) -> Knobs:
-    """The knobs of a scene. Raises GeneratorError if there is no such scene."""
-    if scene not in _KNOBS:
-        raise GeneratorError(unknown_name("scene", scene, list(_KNOBS)))
-    return _KNOBS[scene]()
+def knobs_of(task: str) -> Knobs:
+    """The knobs of a task's scene. Raises GeneratorError if there is no such task."""
+    if task not in _KNOBS:
+        raise GeneratorError(unknown_name("task", task, list(_KNOBS)))
+    return _KNOBS[task]()

@@ -171,8 +171,8 @@ class SheetDeformation(Leveled, SimulatedWithScikitFem):
             problems.append(
                 problem(
                     len(positions) - 1,
-                    f"compressive membrane strain {strain:.2f}, beyond the material law's stability at "
-                    f"{MIN_PRINCIPAL_STRAIN:.2f}",
+                    f"compressive membrane strain {strain:.3f}, beyond the material law's stability at "
+                    f"{MIN_PRINCIPAL_STRAIN:.3f}",
                     REMEDY,
                 )
             )

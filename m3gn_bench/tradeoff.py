@@ -146,7 +146,7 @@ def measure(
     from m3gn_bench.version import __version__
 
     scene = get_scene(task.scene)
-    knobs = knobs or knobs_of(task.scene)
+    knobs = knobs or knobs_of(task.name)
     shipped = [(one, read_description(one.folder)) for one in checkpoints]
     study = Study(
         state,

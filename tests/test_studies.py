@@ -22,7 +22,7 @@ from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.stability import MODEL_CELLS, REASONED
 from m3gn_bench.studies import Cell, Result, Shipped, Study
 from m3gn_bench.study_page import draw, read_records, save
-from m3gn_bench.tasks import get_task
+from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")
 M3GN = Shipped("m3gn", "compact", checkpoint_folder(TASK.name, "m3gn", "compact"))
@@ -122,7 +122,7 @@ def test_grids_are_large_enough() -> None:
     assert len(shipped) * len(MODEL_CELLS) >= 20
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", TASKS)
 def test_knobs_are_sound(name: str) -> None:
     """The default is among the settings, names are unique, meshes get finer."""
     knobs = knobs_of(name)
@@ -192,7 +192,7 @@ def test_models_do_not_mind_where_the_scene_is() -> None:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands measure small grids, and one model."""
-    monkeypatch.setattr("m3gn_bench.generators.knobs.knobs_of", lambda scene: SMALL)
+    monkeypatch.setattr("m3gn_bench.generators.knobs.knobs_of", lambda task: SMALL)
     impossible = replace(FEW, name="nu = 0.5", parameters=replace(FEW.parameters, poisson_ratios=(0.0, 0.5)))
     grid = Extremes((FEW, impossible), 0.1, None)
     monkeypatch.setattr("m3gn_bench.generators.extremes.extremes_of", lambda scene: grid)
