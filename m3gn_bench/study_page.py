@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import ValidationError
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 BUDGETS = (0.1, 0.01, 0.001)  # of error, for which the page names the fastest way
 Way = Simulated | Predicted
+R = TypeVar("R", TradeOff, Stability)
 
 HEADER = """# Speed against accuracy, and stability at the extremes
 
@@ -45,7 +46,7 @@ Every cell is *correct* (within the bound against a finer simulation), *refused*
 def read_records(folder: Path) -> tuple[list[TradeOff], list[Stability]]:
     """All records below a folder, in the order of the tasks. Raises ConfigError naming a file that is none."""
 
-    def read(kind: str, record: type) -> list:  # type: ignore[type-arg]
+    def read(kind: str, record: type[R]) -> list[R]:
         found = []
         for task in TASKS:
             path = folder / f"{kind}-{task}.json"
@@ -201,7 +202,7 @@ def draw(study: TradeOff) -> "Figure":
         shown = [s for s in study.simulators if s.knob == knob and s.error and not s.refused]
         points = [(s.seconds, s.error) for s in shown]
         if points:
-            axes.scatter(*zip(*points, strict=True), s=36, zorder=3, label=knob, color=next(colours))
+            axes.plot(*zip(*points, strict=True), "o", zorder=3, label=knob, color=next(colours))
         for s in shown:
             place = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 7}
             axes.annotate(s.label, (s.seconds, s.error or 0.0), **place)  # type: ignore[arg-type]
@@ -217,7 +218,7 @@ def draw(study: TradeOff) -> "Figure":
         )
         for m in ones:
             axes.annotate(
-                f"context {m.context}",
+                str(m.context),
                 (m.seconds, m.error),
                 xytext=(5, -9),
                 textcoords="offset points",

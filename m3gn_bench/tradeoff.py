@@ -11,6 +11,7 @@ model only the window's frames after the anchor count. Times are CPU seconds of 
 
 import math
 import platform
+import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -170,7 +171,7 @@ def measure(
         for one, description in shipped
         for context in task.context_sizes
     ]
-    ways = [*simulators, *models]
+    ways: list[Simulated | Predicted] = [*simulators, *models]
     front = pareto_front([(way.seconds, math.inf if way.error is None else way.error) for way in ways])
     marked = [way.model_copy(update={"on_front": on}) for way, on in zip(ways, front, strict=True)]
     return TradeOff(
@@ -397,12 +398,10 @@ class Bench:
         """Means over draws of the distances between the three meshes."""
         pairs = ((0, 1), (1, 2))
         distances = [
-            np.mean(
-                [
-                    distance(self._reference(results, i, a), self._reference(results, i, b))
-                    / self._unit(results, i, self.knobs.first)
-                    for i in self.knobs.draws
-                ]
+            statistics.mean(
+                distance(self._reference(results, i, a), self._reference(results, i, b))
+                / self._unit(results, i, self.knobs.first)
+                for i in self.knobs.draws
             )
             for a, b in pairs
         ]
@@ -410,11 +409,11 @@ class Bench:
         order = observed_order(sizes, (distances[0], distances[1]))
         remaining = None
         if order is not None:
-            remaining = float(distances[1] * sizes[2] ** order / (sizes[1] ** order - sizes[2] ** order))
+            remaining = distances[1] * sizes[2] ** order / (sizes[1] ** order - sizes[2] ** order)
         return Convergence(
             levels=tuple(map(repr, self.knobs.meshes)),
             cell_sizes=sizes,
-            distances=(float(distances[0]), float(distances[1])),
+            distances=(distances[0], distances[1]),
             order=order,
             remaining=remaining,
         )
