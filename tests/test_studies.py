@@ -21,7 +21,7 @@ from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.stability import MODEL_CELLS, REASONED
 from m3gn_bench.studies import Cell, Result, Shipped, Study
-from m3gn_bench.study_page import draw, read_records, save
+from m3gn_bench.study_page import draw, read_records, render, save
 from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")
@@ -286,3 +286,39 @@ def test_a_damaged_record_is_named(tmp_path: Path) -> None:
 def test_mistakes_are_explained(arguments: list[str], message: str) -> None:
     done = CliRunner().invoke(cli, arguments)
     assert message in str(done.exception)
+
+
+# -- what is on record -------------------------------------------------------------------------------------
+
+RECORDS = Path(__file__).parents[1] / "docs" / "studies"
+
+
+def test_recorded_tradeoffs() -> None:
+    """Every task has one: its default fidelity is on the front, and its reference is better than that."""
+    found, _ = read_records(RECORDS)
+    assert [study.task for study in found] == list(TASKS)
+    for study in found:
+        default = next(s for s in study.simulators if (s.knob, s.label) == ("fidelity", "default"))
+        assert default.on_front, study.task
+        assert not default.refused
+        assert default.error
+        assert study.convergence.order
+        assert study.convergence.remaining
+        assert study.convergence.remaining < default.error, study.task
+
+
+def test_recorded_stability() -> None:
+    """At least 60 cells of the five scenes and 20 of models, none wrong, and what is refused has all its reasons."""
+    _, found = read_records(RECORDS)
+    scenes = {study.scene: study for study in found}
+    assert set(scenes) == set(scene_names())
+    simulated = [c for study in scenes.values() for c in study.cells if c.subject == "simulator"]
+    predicted = [c for study in found for c in study.cells if c.subject != "simulator"]
+    assert len(simulated) >= 60
+    assert len(predicted) >= 20
+    assert [cell for study in found for cell in study.wrong] == []
+    assert all(REASONED.fullmatch(cell.detail) for cell in simulated if cell.verdict == "refused")
+
+
+def test_the_page_is_up_to_date() -> None:
+    assert render(*read_records(RECORDS)) == (RECORDS.parent / "tradeoff.md").read_text()
