@@ -201,7 +201,9 @@ class _FallingObjects(Leveled, SingleTask):
                 "min_volume_ratio": float(ratios.min()),
                 "inverted_tetrahedra": int(inverted.max()),
                 "inverted_tetrahedra_at_end": int(inverted[-1]),
-                "self_penetrating_nodes_at_end": _self_penetrating(motion.positions[-1], solid, recorded),
+                "self_penetrating_nodes_at_end": int(
+                    self_penetrating(motion.positions[-1], solid, recorded).sum()
+                ),
                 "energy_growth": float(growth.max() / total[0]),
                 "energy_growth_frame": len(times) + int(growth.argmax()),
                 "energy_left": float(total[-1] / total[0]),
@@ -334,8 +336,8 @@ class MixedObjects(_FallingObjects):
     )
 
 
-def _self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: int) -> int:
-    """How many of the recorded nodes lie inside a tetrahedron that is not their own."""
+def self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: int) -> np.ndarray:
+    """Which of the recorded nodes lie inside a tetrahedron that is not their own, shape [recorded]."""
     corners = positions[solid.tetrahedra]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     # A cell with four nodes on the floor is flat, and nothing is inside it.
@@ -349,7 +351,7 @@ def _self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: 
             mine = np.flatnonzero(own < recorded)
             inside[mine, own[mine]] = False
         penetrating |= inside.any(0)
-    return int(penetrating.sum())
+    return penetrating
 
 
 def flight_frames(height: float) -> int:
