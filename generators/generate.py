@@ -4,17 +4,11 @@ import fcntl
 import os
 import platform
 import shutil
-import signal
-import threading
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +30,7 @@ from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.scene import Scene
+from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.version import __version__
 
 MAX_ATTEMPTS = 10
@@ -160,7 +155,9 @@ def generate(
             done = len(wanted) - len(todo)
             on_progress(done, len(wanted))
             jobs = ((scene, shards[key], key, *wanted[key], metadata) for key in todo)
-            with closing(_run(jobs, workers)) as finished:  # so that an exception here ends the workers, too
+            with closing(
+                run_jobs(_make_shard, jobs, workers)
+            ) as finished:  # so that an exception here ends the workers, too
                 for _ in finished:
                     done += 1
                     on_progress(done, len(wanted))
@@ -248,57 +245,3 @@ def _make_shard(job: _Job) -> None:
     scene, path, key, split, index, metadata = job
     trajectory, rejected = simulate_one(scene, split, index, seed=metadata.seed, fidelity=metadata.fidelity)
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
-
-
-def _run(jobs: Iterator[_Job], workers: int) -> Generator[None]:
-    """Run the jobs, yielding once per finished one; a failure or an interrupt stops the rest at once."""
-    if workers == 1:
-        for job in jobs:
-            _make_shard(job)
-            yield
-        return
-    context = get_context("spawn")
-    end, parent_lives = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(end,))
-    try:
-        pending: set[Future[None]] = set()
-        for job in jobs:
-            with _interrupts_held():
-                pending.add(pool.submit(_make_shard, job))
-            if len(pending) >= 2 * workers:
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    future.result()
-                    yield
-        for future in pending:
-            future.result()
-            yield
-        pool.shutdown()  # all done: let workers end by themselves, before the pipe tells them to
-    except BrokenProcessPool as error:
-        raise GeneratorError(
-            "a worker process died (out of memory, or killed); run the same command again to go on"
-        ) from error
-    finally:
-        parent_lives.close()
-        pool.shutdown(cancel_futures=True)
-        end.close()
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C is for this process alone, a moment later: processes started in here inherit deafness to it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with(end: Connection) -> None:
-    """End this worker, whatever it does, once the parent closes its side of the pipe or is killed."""
-
-    def watch() -> None:
-        end.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

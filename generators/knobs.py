@@ -203,9 +203,9 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
 
     return Knobs(
         draws=draws,
-        first=33,  # from the impact on, 0.2 s: later motion is chaotic
-        last=52,
-        frames=53,
+        first=33,  # 0.1 s from the impact on: what follows is more and more sensitive to everything
+        last=42,
+        frames=43,
         size=SIZE,
         settings=(
             *_fidelities(scene),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from m3gn_bench.console import DATA, JSON, Report, table
+from m3gn_bench.console import DATA, JSON, WORKERS, Report, table
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.study_commands import render_studies, stability, tradeoff
 from m3gn_bench.version import __version__
@@ -29,9 +29,6 @@ THREADS = click.option(
     type=click.IntRange(min=1),
     default=os.cpu_count() or 1,
     help="Of torch.  [default: all cores]",
-)
-WORKERS = click.option(
-    "--workers", type=int, default=os.cpu_count() or 1, help="Processes that simulate.  [default: all cores]"
 )
 
 

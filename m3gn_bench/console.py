@@ -31,6 +31,9 @@ DATA = click.option(
     default=lambda: Path(os.environ.get("M3GN_BENCH_DATA", "data")),
     help="Folder of dataset files.  [default: $M3GN_BENCH_DATA, or ./data]",
 )
+WORKERS = click.option(
+    "--workers", type=int, default=os.cpu_count() or 1, help="Processes that simulate.  [default: all cores]"
+)
 OnProgress = Callable[[int, int], None]
 
 

@@ -9,8 +9,9 @@ or *wrong*: not finite, or further from the anchor than `MODEL_BOUND` times the 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -82,6 +83,7 @@ def measure(
     state: Path,
     *,
     extremes: "Extremes | None" = None,
+    workers: int = 1,
     on_progress: OnProgress = lambda done, total: None,
 ) -> tuple[Stability, Study]:
     """Judge every cell of a task; call `finish` of the study that is returned once the result is kept.
@@ -91,11 +93,13 @@ def measure(
         checkpoints: trained models of that task.
         state: folder for results so far; an interrupted run goes on from there.
         extremes: another grid than the scene's own.
+        workers: processes for the simulations.
         on_progress: called with the numbers of cells done and in total.
     """
     from m3gn_bench.generators.extremes import extremes_of
     from m3gn_bench.generators.generate import machine
     from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.generators.workers import run_jobs
     from m3gn_bench.version import __version__
 
     scene = get_scene(task.scene)
@@ -110,17 +114,21 @@ def measure(
         },
     )
     cells = [
-        Cell(f"simulator: {one.name}", lambda one=one: _as_result(judge(task.scene, one, grid)))  # type: ignore[misc]
+        Cell(
+            f"simulator: {one.name}",
+            partial(_judged, task.scene, one, grid.allowed, grid.size),
+            timed=False,
+        )
         for one in grid.cells
     ]
     cells += [
-        Cell(f"{one.folder.name}: {name}", lambda o=one, n=name: _as_result(judge_model(task, o, n)))  # type: ignore[misc]
+        Cell(f"{one.folder.name}: {name}", lambda o=one, n=name: Result(judge_model(task, o, n).model_dump()))  # type: ignore[misc]
         for one in checkpoints
         for name in MODEL_CELLS
     ]
     use_cpu(1)
     with threadpool_limits(1):
-        results = study.measure(cells, on_progress)
+        results = study.measure(cells, on_progress, partial(run_jobs, workers=workers))
     return Stability(
         task=task.name,
         scene=scene.name,
@@ -136,15 +144,22 @@ def measure(
     ), study
 
 
-def _as_result(judged: Judged) -> Result:
-    return Result(judged.model_dump())
+def _judged(*arguments: Any) -> Result:
+    with threadpool_limits(1):
+        return Result(judge(*arguments).model_dump())
 
 
 # -- simulators --------------------------------------------------------------------------------------------
 
 
-def judge(scene_name: str, cell: "Extreme", grid: "Extremes") -> Judged:
-    """Simulate a cell and, unless it is refused, the same on the finer mesh."""
+def judge(scene_name: str, cell: "Extreme", allowed: float, size: float | None) -> Judged:
+    """Simulate a cell and, unless it is refused, the same on the finer mesh.
+
+    Args:
+        scene_name: of the scene.
+        cell: of its grid.
+        allowed, size: see `generators.extremes.Extremes`.
+    """
     from m3gn_bench.generators.scene import get_scene
 
     def judged(verdict: Verdict, error: float | None = None, detail: str = "") -> Judged:
@@ -175,11 +190,11 @@ def judge(scene_name: str, cell: "Extreme", grid: "Extremes") -> Judged:
         return judged("wrong", detail=f"valid, but not on the finer mesh: {error}")
     window = slice(cell.first, cell.last + 1)
     found, truth = trajectory.positions[window], reference.positions[window]
-    unit = distance(truth, reference.mesh.rest_positions) if grid.size is None else grid.size
+    unit = distance(truth, reference.mesh.rest_positions) if size is None else size
     apart = distance(found, truth)
     error_found = apart / unit if apart else 0.0  # nothing moves where forces cancel
     # A comparison with NaN is false, so it counts as wrong.
-    correct = error_found <= grid.allowed
+    correct = error_found <= allowed
     return judged(
         "correct" if correct else "wrong", error_found, "" if correct else "far from the finer mesh"
     )

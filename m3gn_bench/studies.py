@@ -3,7 +3,8 @@
 import io
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from m3gn_bench.errors import ConfigError
 from m3gn_bench.version import __version__
 
 OnProgress = Callable[[int, int], None]
+RunJobs = Callable[..., Generator[tuple[str, "Result"]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +34,15 @@ class Result:
 
 @dataclass(frozen=True)
 class Cell:
-    """One measurement of a study, with a name that is unique in it."""
+    """One measurement of a study, with a name that is unique in it.
+
+    Where no time is taken, several are measured at once, in processes of their own: then pickle must be able to
+    send `measure`.
+    """
 
     name: str
     measure: Callable[[], Result]
+    timed: bool = True
 
 
 class Study:
@@ -61,22 +68,39 @@ class Study:
         except OSError as error:
             raise ConfigError(f"cannot write to {folder}: {error.strerror or error}") from error
 
-    def measure(self, cells: Sequence[Cell], on_progress: OnProgress) -> dict[str, Result]:
-        """The results of all cells by their names; those that an interrupted run has left are not made again."""
-        results = {}
-        for number, cell in enumerate(cells):
-            on_progress(number, len(cells))
-            path = self.folder / f"{number:03}.npz"
-            kept = _read(path)
-            if kept is None or kept.values["key"] != cell.name:
-                made = cell.measure()
-                kept = Result({**made.values, "key": cell.name}, made.arrays)
-                buffer = io.BytesIO()
-                np.savez(buffer, values=np.array(json.dumps(kept.values)), **kept.arrays)  # type: ignore[arg-type]
-                write_bytes_atomically(path, buffer.getvalue())
-            results[cell.name] = kept
-        on_progress(len(cells), len(cells))
-        return results
+    def measure(
+        self, cells: Sequence[Cell], on_progress: OnProgress, run_jobs: RunJobs | None = None
+    ) -> dict[str, Result]:
+        """The results of all cells by their names; those that an interrupted run has left are not made again.
+
+        Args:
+            cells: of the study.
+            on_progress: called with the numbers of cells done and in total.
+            run_jobs: runs cells without a time in several processes (`generators.workers`); None: here.
+        """
+        paths = {cell.name: self.folder / f"{number:03}.npz" for number, cell in enumerate(cells)}
+        kept = {name: _read(path) for name, path in paths.items()}
+        results = {
+            name: found for name, found in kept.items() if found is not None and found.values["key"] == name
+        }
+
+        def keep(name: str, made: Result) -> None:
+            results[name] = Result({**made.values, "key": name}, made.arrays)
+            buffer = io.BytesIO()
+            np.savez(buffer, values=np.array(json.dumps(results[name].values)), **made.arrays)  # type: ignore[arg-type]
+            write_bytes_atomically(paths[name], buffer.getvalue())
+            on_progress(len(results), len(cells))
+
+        on_progress(len(results), len(cells))
+        todo = [cell for cell in cells if cell.name not in results]
+        alone = [cell for cell in todo if cell.timed or run_jobs is None]
+        for cell in alone:
+            keep(cell.name, cell.measure())
+        if run_jobs is not None:
+            with closing(run_jobs(_measured, [cell for cell in todo if not cell.timed])) as finished:
+                for name, made in finished:
+                    keep(name, made)
+        return {cell.name: results[cell.name] for cell in cells}
 
     def finish(self) -> None:
         """Delete the folder: what it held is kept elsewhere, and the next study begins anew."""
@@ -96,6 +120,10 @@ def distance(one: np.ndarray, other: np.ndarray) -> float:
     """Root mean square distance of nodes, of positions [..., nodes, dim]."""
     squared = (one.astype(np.float64) - other.astype(np.float64)) ** 2
     return float(np.sqrt(squared.sum(-1).mean()))
+
+
+def _measured(cell: Cell) -> tuple[str, Result]:
+    return cell.name, cell.measure()
 
 
 def _read(path: Path) -> Result | None:

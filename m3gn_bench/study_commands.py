@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from m3gn_bench.console import DATA, JSON, Report, table
+from m3gn_bench.console import DATA, JSON, WORKERS, Report, table
 
 if TYPE_CHECKING:
     from m3gn_bench.studies import Shipped
@@ -60,6 +60,7 @@ def _checkpoints(task: "Task", folders: tuple[Path, ...]) -> "list[Shipped]":
 )
 @CHECKPOINTS
 @RECORD
+@WORKERS
 @DATA
 @JSON
 def tradeoff(
@@ -67,6 +68,7 @@ def tradeoff(
     output: Path | None,
     folders: tuple[Path, ...],
     record_home: Path | None,
+    workers: int,
     data: Path,
     as_json: bool,
 ) -> None:
@@ -133,10 +135,16 @@ def tradeoff(
 @click.argument("task_name", metavar="[TASK]", required=False)
 @CHECKPOINTS
 @RECORD
+@WORKERS
 @DATA
 @JSON
 def stability(
-    task_name: str | None, folders: tuple[Path, ...], record_home: Path | None, data: Path, as_json: bool
+    task_name: str | None,
+    folders: tuple[Path, ...],
+    record_home: Path | None,
+    workers: int,
+    data: Path,
+    as_json: bool,
 ) -> None:
     """Simulators and models at their extremes; exit code 1 if any cell is wrong.
 
@@ -152,7 +160,11 @@ def stability(
     for task, shipped in chosen:
         with report.progress(f"judging {task.name}") as on_progress:
             result, study = measure(
-                task, shipped, data / f"stability-{task.name}.partial", on_progress=on_progress
+                task,
+                shipped,
+                data / f"stability-{task.name}.partial",
+                workers=workers,
+                on_progress=on_progress,
             )
         results.append(result)
         studies.append(study)

@@ -96,7 +96,12 @@ def advice(study: TradeOff) -> list[str]:
     second = (
         f"The default fidelity is off by {_percent(default.error)}, of which "
         f"{_percent(default.error_of_steps)} come from steps and {_percent(default.error_of_mesh)} from the mesh; the "
-        f"reference itself is off by {_percent(remaining)} (order {study.convergence.order:.1f})."
+        f"reference itself is off by {_percent(remaining)} (order {study.convergence.order:.1f})"
+        + (
+            "."
+            if is_converged(study)
+            else ", so it is not converged: take errors of the mesh for a lower bound."
+        )
         if study.convergence.order is not None
         else f"The default fidelity is off by {_percent(default.error)} from a reference whose own error is not known."
     )
@@ -113,6 +118,13 @@ def advice(study: TradeOff) -> list[str]:
                 f"({best_model.pays_off_with_data} with its training data)."
             )
     return [first, second, third]
+
+
+def is_converged(study: TradeOff) -> bool:
+    """Whether the reference's own error is less than half of what the default fidelity differs from it."""
+    default = next(s for s in study.simulators if (s.knob, s.label) == ("fidelity", "default"))
+    remaining = study.convergence.remaining
+    return None not in (remaining, default.error) and 2 * (remaining or 0) < (default.error or 0)
 
 
 def _tradeoff(study: TradeOff) -> str:

@@ -14,6 +14,7 @@ import platform
 import statistics
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +132,7 @@ def measure(
     state: Path,
     *,
     knobs: "Knobs | None" = None,
+    workers: int = 1,
     on_progress: OnProgress = lambda done, total: None,
 ) -> tuple[TradeOff, Study]:
     """Measure a task's trade-off; call `finish` of the study that is returned once the result is kept.
@@ -140,10 +142,12 @@ def measure(
         checkpoints: trained models of that task.
         state: folder for results so far; an interrupted run goes on from there.
         knobs: other settings and draws than the scene's own.
+        workers: processes for what is not timed.
         on_progress: called with the numbers of measurements done and in total.
     """
     from m3gn_bench.generators.knobs import knobs_of
     from m3gn_bench.generators.scene import get_scene
+    from m3gn_bench.generators.workers import run_jobs
     from m3gn_bench.version import __version__
 
     scene = get_scene(task.scene)
@@ -162,7 +166,8 @@ def measure(
     use_cpu(1)
     bench = Bench(task, scene, knobs)
     with threadpool_limits(1):
-        results = study.measure(bench.cells([one for one, _ in shipped]), on_progress)
+        run = partial(run_jobs, workers=workers)
+        results = study.measure(bench.cells([one for one, _ in shipped]), on_progress, run)
     simulators = bench.simulators(results)
     default = next(s for s in simulators if (s.knob, s.label) == ("fidelity", "default"))
     data_seconds = default.seconds * sum(scene.paper_sizes[s] for s in ("train", "validation"))
@@ -254,8 +259,13 @@ class Bench:
         compared = dict.fromkeys(
             [*(self._companion(s) for s in self.knobs.settings if not s.options), *self.knobs.meshes]
         )
+        window = slice(self.knobs.first, self.knobs.last + 1)
         cells += [
-            Cell(_quiet_name(level, i), lambda v=level, i=i: self._quiet(v, i))  # type: ignore[misc]
+            Cell(
+                _untimed_name(level, i),
+                partial(untimed, self.scene.name, self.parameters[i], level, self.knobs.frames, window),
+                timed=False,
+            )
             for level in compared
             for i in self.knobs.draws
         ]
@@ -293,11 +303,6 @@ class Bench:
         trajectory = scene.simulate_with(self.parameters[index], level, frames)
         return time.process_time() - start, trajectory
 
-    def _quiet(self, level: Any, index: int) -> Result:
-        """Nodes in the window, untimed."""
-        trajectory = self.scene.simulate_with(self.parameters[index], level, self.knobs.frames)
-        return Result({}, {"positions": self._window(trajectory.positions)})
-
     def _window(self, positions: np.ndarray) -> np.ndarray:
         return positions[self.knobs.first : self.knobs.last + 1]
 
@@ -324,7 +329,7 @@ class Bench:
     # -- what follows ----------------------------------------------------------------------------------
 
     def _reference(self, results: dict[str, Result], index: int, level: int = -1) -> np.ndarray:
-        return results[_quiet_name(self.knobs.meshes[level], index)].arrays["positions"]
+        return results[_untimed_name(self.knobs.meshes[level], index)].arrays["positions"]
 
     def _unit(self, results: dict[str, Result], index: int, first: int) -> float:
         if self.knobs.size is not None:
@@ -363,7 +368,7 @@ class Bench:
         total = distance(positions, reference) / unit
         if setting.options:
             return total, math.nan, math.nan
-        companion = results[_quiet_name(self._companion(setting), index)].arrays["positions"]
+        companion = results[_untimed_name(self._companion(setting), index)].arrays["positions"]
         return total, distance(positions, companion) / unit, distance(companion, reference) / unit
 
     def predicted(
@@ -419,5 +424,14 @@ class Bench:
         )
 
 
-def _quiet_name(level: Any, index: int) -> str:
+def untimed(scene_name: str, parameters: Any, level: Any, frames: int, window: slice) -> Result:
+    """Nodes in a window of frames, by one thread."""
+    from m3gn_bench.generators.scene import get_scene
+
+    with threadpool_limits(1):
+        trajectory = get_scene(scene_name).simulate_with(parameters, level, frames)
+    return Result({}, {"positions": trajectory.positions[window]})
+
+
+def _untimed_name(level: Any, index: int) -> str:
     return f"{level} {index}"

@@ -34,6 +34,13 @@ class Import(NamedTuple):
     line: int
 
 
+def runs_later(node: ast.AST) -> bool:
+    """Whether an import inside the node does not run when the module is loaded."""
+    if isinstance(node, ast.If) and isinstance(node.test, ast.Name):
+        return node.test.id == "TYPE_CHECKING"
+    return isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+
+
 def our_imports(source: str) -> Iterator[Import]:
     """Every import of one of our modules; "version" counts as a room of its own, for it needs nothing."""
 
@@ -52,7 +59,7 @@ def our_imports(source: str) -> Iterator[Import]:
                 place = rest[0] if package == "m3gn_bench" and rest else package
                 yield Import(place if place in ROOMS | {"version"} else "m3gn_bench", lazy, node.lineno)
         for child in ast.iter_child_nodes(node):
-            yield from visit(child, lazy or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+            yield from visit(child, lazy or runs_later(node))
 
     yield from visit(ast.parse(source), False)
 
