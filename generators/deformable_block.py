@@ -287,7 +287,12 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
                 )
             )
         drop = found["max_force_drop"]
-        if drop > MAX_FORCE_DROP:
+        if drop == 1:
+            what = "the circle does not touch the block: the contact force is 0"
+            problems.append(
+                problem(int(found["max_force_drop_frame"]), what, "let it move onto the block's top")
+            )
+        elif drop > MAX_FORCE_DROP:
             problems.append(
                 problem(
                     int(found["max_force_drop_frame"]),
@@ -324,6 +329,8 @@ def max_force_drop(forces: Array) -> tuple[float, int]:
     if forces.min() <= 0:
         return 1.0, int(forces.argmin())
     settled = forces[TRANSIENT:]
+    if not settled.size:
+        return 0.0, 0
     drops = 1 - settled / np.maximum.accumulate(settled)
     return float(drops.max()), TRANSIENT + int(drops.argmax())
 

@@ -9,6 +9,10 @@ class GeneratorError(BenchError):
     """A dataset cannot be generated as asked."""
 
 
+class ParameterError(GeneratorError, ValueError):
+    """A parameter of a simulation is outside its physical range."""
+
+
 class SolverError(BenchError):
     """A solver did not reach equilibrium. The draw is rejected and counted, never kept."""
 

@@ -17,7 +17,13 @@ from scipy.spatial.transform import Rotation
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FREE, VTK_TRIANGLE, Mesh, Trajectory
-from m3gn_bench.generators.errors import GeneratorError, SolverError, problem, require_installed
+from m3gn_bench.generators.errors import (
+    GeneratorError,
+    ParameterError,
+    SolverError,
+    problem,
+    require_installed,
+)
 from m3gn_bench.generators.objects import SoftBody, load_object
 from m3gn_bench.generators.scene import Leveled, SingleTask
 from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
@@ -138,7 +144,7 @@ class _FallingObjects(Leveled, SingleTask):
 
         Raises:
             SolverError: positions are not finite even with steps of an eighth.
-            ValueError: a parameter is out of its physical range, or the floor is not reached in so many frames.
+            ParameterError: a parameter is out of its physical range, or the floor is not reached in so many frames.
         """
         frames = self.frames if frames is None else frames
         body = self.body(parameters.object)
@@ -153,7 +159,7 @@ class _FallingObjects(Leveled, SingleTask):
         down = np.array([0.0, 0.0, -GRAVITY])
         times = _flight_times(parameters.height)
         if frames <= len(times):
-            raise ValueError(f"frames must be more than the {len(times)} of the free fall, not {frames}")
+            raise ParameterError(f"frames must be more than the {len(times)} of the free fall, not {frames}")
         flight = start[:recorded] + down / 2 * times[:, None, None] ** 2
         solid, substeps = self._solid(start, body.tetrahedra, parameters, level)
         for halving in range(MAX_HALVINGS + 1):

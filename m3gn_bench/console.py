@@ -32,7 +32,10 @@ DATA = click.option(
     help="Folder of dataset files.  [default: $M3GN_BENCH_DATA, or ./data]",
 )
 WORKERS = click.option(
-    "--workers", type=int, default=os.cpu_count() or 1, help="Processes that simulate.  [default: all cores]"
+    "--workers",
+    type=click.IntRange(min=1),
+    default=os.cpu_count() or 1,
+    help="Processes that simulate.  [default: all cores]",
 )
 OnProgress = Callable[[int, int], None]
 

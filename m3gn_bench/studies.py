@@ -61,7 +61,7 @@ class Study:
         head = json.dumps({"settings": settings, "version": __version__}, sort_keys=True).encode()
         written = folder / "settings.json"
         try:
-            if written.is_file() and written.read_bytes() != head:
+            if folder.is_dir() and not (written.is_file() and written.read_bytes() == head):
                 shutil.rmtree(folder)
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes_atomically(written, head)
@@ -104,6 +104,9 @@ class Study:
 
     def finish(self) -> None:
         """Delete the folder: what it held is kept elsewhere, and the next study begins anew."""
+        (
+            self.folder / "settings.json"
+        ).unlink()  # without it a folder that is half deleted counts for nothing
         shutil.rmtree(self.folder)
 
 

@@ -76,16 +76,18 @@ def tradeoff(
 
     Takes some minutes; an interrupted run goes on where it stopped.
     """
-    from m3gn_bench.study_page import advice, draw, save
+    from m3gn_bench.study_page import advice, draw, require_drawable, save
     from m3gn_bench.tasks import get_task
     from m3gn_bench.tradeoff import measure
 
     report = Report(as_json)
     task = get_task(task_name)
     shipped = _checkpoints(task, folders)
+    if output is not None:
+        require_drawable(output)
     with report.progress(f"measuring {task.name}") as on_progress:
         result, study = measure(
-            task, shipped, data / f"tradeoff-{task.name}.partial", on_progress=on_progress
+            task, shipped, data / f"tradeoff-{task.name}.partial", workers=workers, on_progress=on_progress
         )
     if record_home is not None:
         _write(record_home / f"tradeoff-{task.name}.json", result.model_dump_json(indent=1))
@@ -103,7 +105,7 @@ def tradeoff(
             [
                 [
                     f"{s.knob}: {s.label}",
-                    f"{s.seconds:.3g}",
+                    "" if s.seconds is None else f"{s.seconds:.3g}",
                     *map(percent, (s.error, s.error_of_steps, s.error_of_mesh)),
                     "yes" if s.on_front else "",
                     len(s.refused) or "",

@@ -10,7 +10,6 @@ model only the window's frames after the anchor count. Times are CPU seconds of 
 """
 
 import math
-import platform
 import statistics
 import time
 from collections.abc import Sequence
@@ -25,7 +24,6 @@ from threadpoolctl import threadpool_limits
 from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import case_from
-from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
 from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
 from m3gn_bench.tasks import Task
@@ -49,16 +47,18 @@ class Simulated(Record):
         error: distance from the reference.
         error_of_steps: distance from the same mesh with fine steps.
         error_of_mesh: distance of that from the reference.
+        extrapolated: the time is that of fewer frames, and of each further one.
         refused: reasons, one for every draw that the scene's checks or the solver refused.
-        on_front: no other way is clearly both faster and more accurate (see `pareto_front`).
+        on_front: no other way is better (see `pareto_front`).
     """
 
     knob: str
     label: str
-    seconds: float
+    seconds: float | None
     error: float | None
     error_of_steps: float | None
     error_of_mesh: float | None
+    extrapolated: bool = False
     refused: tuple[str, ...] = ()
     on_front: bool = False
 
@@ -125,6 +125,30 @@ class TradeOff(Record):
     simulators: tuple[Simulated, ...]
     models: tuple[Predicted, ...]
 
+    @property
+    def default(self) -> Simulated:
+        """The benchmark's own fidelity."""
+        return next(s for s in self.simulators if (s.knob, s.label) == ("fidelity", "default"))
+
+    def with_front(self) -> "TradeOff":
+        """The same with every way marked that lies on the front; refused settings do not."""
+        ways: list[Simulated | Predicted] = [*self.simulators, *self.models]
+        front = pareto_front(
+            [
+                (math.inf, math.inf)
+                if way.seconds is None or way.error is None or (isinstance(way, Simulated) and way.refused)
+                else (way.seconds, way.error)
+                for way in ways
+            ]
+        )
+        marked = [way.model_copy(update={"on_front": on}) for way, on in zip(ways, front, strict=True)]
+        return self.model_copy(
+            update={
+                "simulators": tuple(way for way in marked if isinstance(way, Simulated)),
+                "models": tuple(way for way in marked if isinstance(way, Predicted)),
+            }
+        )
+
 
 def measure(
     task: Task,
@@ -145,6 +169,8 @@ def measure(
         workers: processes for what is not timed.
         on_progress: called with the numbers of measurements done and in total.
     """
+    from m3gn_bench.generators.errors import GeneratorError
+    from m3gn_bench.generators.generate import machine
     from m3gn_bench.generators.knobs import knobs_of
     from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.generators.workers import run_jobs
@@ -158,9 +184,11 @@ def measure(
         {
             "task": task.name,
             "dataset_version": scene.dataset_version,
-            "knobs": repr([knobs.draws, knobs.frames, knobs.settings, knobs.meshes]),
-            "checkpoints": [description.weights_sha256 for _, description in shipped],
-            "machine": platform.processor() or platform.machine(),
+            "knobs": repr(
+                [getattr(knobs, name) for name in ("draws", "first", "last", "frames", "settings", "meshes")]
+            ),
+            "simulators": scene.simulator_versions(),
+            "machine": machine(),
         },
     )
     use_cpu(1)
@@ -170,15 +198,21 @@ def measure(
         results = study.measure(bench.cells([one for one, _ in shipped]), on_progress, run)
     simulators = bench.simulators(results)
     default = next(s for s in simulators if (s.knob, s.label) == ("fidelity", "default"))
-    data_seconds = default.seconds * sum(scene.paper_sizes[s] for s in ("train", "validation"))
+    if default.refused or default.seconds is None:
+        raise GeneratorError(f"the default fidelity is refused: {default.refused[0]}")
+    data_seconds = default.seconds * sum(
+        scene.task_size(task.name, split, scene.paper_sizes[split]) for split in ("train", "validation")
+    )
     models = [
-        _pay_off(bench.predicted(results, one, context, 60 * description.minutes), simulators, data_seconds)
+        _pay_off(
+            bench.predicted(results, one, context, 60 * description.minutes),
+            # On the frames that the model is judged by.
+            bench.simulators(results, max(context, knobs.first)),
+            data_seconds,
+        )
         for one, description in shipped
         for context in task.context_sizes
     ]
-    ways: list[Simulated | Predicted] = [*simulators, *models]
-    front = pareto_front([(way.seconds, math.inf if way.error is None else way.error) for way in ways])
-    marked = [way.model_copy(update={"on_front": on}) for way, on in zip(ways, front, strict=True)]
     return TradeOff(
         task=task.name,
         scene=scene.name,
@@ -189,16 +223,18 @@ def measure(
         window=(knobs.first, knobs.last),
         unit="displacement" if knobs.size is None else "size of the object",
         convergence=bench.convergence(results),
-        simulators=tuple(way for way in marked if isinstance(way, Simulated)),
-        models=tuple(way for way in marked if isinstance(way, Predicted)),
-    ), study
+        simulators=tuple(simulators),
+        models=tuple(models),
+    ).with_front(), study
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which (seconds, error) no other beats in both by more than the margins within which they count as equal."""
+    """Which (seconds, error) no other is better than: clearly in one respect, and not clearly worse in the other."""
 
     def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
-        return one[0] * TIME_MARGIN < other[0] and one[1] * ERROR_MARGIN < other[1]
+        faster, better = one[0] * TIME_MARGIN < other[0], one[1] * ERROR_MARGIN < other[1]
+        slower, worse = other[0] * TIME_MARGIN < one[0], other[1] * ERROR_MARGIN < one[1]
+        return (faster and not worse) or (better and not slower)
 
     return [math.isfinite(p[1]) and not any(beats(other, p) for other in points) for p in points]
 
@@ -218,12 +254,16 @@ def observed_order(cell_sizes: Sequence[float], distances: tuple[float, float]) 
 
 def _pay_off(model: Predicted, simulators: Sequence[Simulated], data_seconds: float) -> Predicted:
     """After how many trajectories the model has cost less than the fastest simulator that is as accurate."""
-    rivals = [s for s in simulators if s.error is not None and s.error <= model.error and not s.refused]
+    rivals = [
+        (s.seconds, f"{s.knob}: {s.label}")
+        for s in simulators
+        if s.error is not None and s.seconds is not None and s.error <= model.error and not s.refused
+    ]
     if not rivals:
         return model
-    rival = min(rivals, key=lambda s: s.seconds)
-    found: dict[str, Any] = {"rival": f"{rival.knob}: {rival.label}"}
-    saved = rival.seconds - model.seconds
+    seconds, rival = min(rivals)
+    found: dict[str, Any] = {"rival": rival}
+    saved = seconds - model.seconds
     if saved > 0:
         found["pays_off_after"] = math.ceil(model.training_seconds / saved)
         found["pays_off_with_data"] = math.ceil((model.training_seconds + data_seconds) / saved)
@@ -250,7 +290,7 @@ class Bench:
             for i in self.knobs.draws
         ]
         cells += [
-            Cell(f"{one.folder} {context} {i}", lambda o=one, c=context, i=i: self._predict(o, c, i))  # type: ignore[misc]
+            Cell(f"{_model_name(one)} {context} {i}", lambda o=one, c=context, i=i: self._predict(o, c, i))  # type: ignore[misc]
             for one in shipped
             for context in self.task.context_sizes
             for i in self.knobs.draws
@@ -276,20 +316,22 @@ class Bench:
 
     def _timed(self, setting: "Setting", index: int) -> Result:
         """CPU seconds of a whole trajectory, and its nodes in the window; or why it is refused."""
+        from m3gn_bench.generators.errors import GeneratorError, SolverError
         from m3gn_bench.generators.scene import get_scene
 
-        scene = get_scene(self.task.scene, **setting.options)
         full = self.knobs.full_length(setting)
         try:
+            scene = get_scene(self.task.scene, **setting.options)
             seconds, trajectory = self._run(scene, setting.level, index, None if full else self.knobs.frames)
             if not full:  # setting up costs once, frames cost each
                 short = self.knobs.first + 1
                 start, _ = self._run(scene, setting.level, index, short)
                 each = (seconds - start) / (self.knobs.frames - short)
                 seconds = start + each * (scene.frames - short)
-        except (BenchError, ValueError) as error:
+        except (SolverError, GeneratorError) as error:  # not solved; or a library is not installed
             return Result({"refused": str(error), "seconds": None})
-        problems = scene.check(trajectory)
+        # A body that is seen in mid-impact only is not judged by how it ends.
+        problems = scene.check(trajectory) if full else []
         return Result(
             {"refused": "; ".join(problems) or None, "seconds": seconds},
             {"positions": self._window(trajectory.positions), "rest": trajectory.mesh.rest_positions},
@@ -337,38 +379,40 @@ class Bench:
         rest = results[f"fidelity: default {index}"].arrays["rest"]
         return distance(self._reference(results, index)[first - self.knobs.first :], rest)
 
-    def simulators(self, results: dict[str, Result]) -> list[Simulated]:
-        """Means over draws of every setting."""
+    def simulators(self, results: dict[str, Result], first: int | None = None) -> list[Simulated]:
+        """Means of every setting over the draws that are not refused, from frame `first` on (the window's, if None)."""
         found = []
         for setting in self.knobs.settings:
             made = {i: results[f"{setting.name} {i}"] for i in self.knobs.draws}
             good = [i for i, result in made.items() if result.values["refused"] is None]
-            timed = [r.values["seconds"] for r in made.values() if r.values["seconds"] is not None]
-            errors = np.array([self._split(results, setting, i, made[i]) for i in good]).reshape(-1, 3)
+            errors = np.array([self._split(results, setting, i, first) for i in good]).reshape(-1, 3)
             total, steps, mesh = errors.mean(0).tolist() if good else (None, None, None)
             found.append(
                 Simulated(
                     knob=setting.knob,
                     label=setting.label,
-                    seconds=float(np.mean(timed)) if timed else math.inf,
+                    seconds=statistics.mean(made[i].values["seconds"] for i in good) if good else None,
                     error=total,
                     error_of_steps=None if setting.options else steps,
                     error_of_mesh=None if setting.options else mesh,
+                    extrapolated=not self.knobs.full_length(setting),
                     refused=tuple(r.values["refused"] for r in made.values() if r.values["refused"]),
                 )
             )
         return found
 
     def _split(
-        self, results: dict[str, Result], setting: "Setting", index: int, made: Result
+        self, results: dict[str, Result], setting: "Setting", index: int, first: int | None
     ) -> tuple[float, float, float]:
         """Error, and its parts by steps and by mesh (no parts for another solver, which has no companion)."""
-        unit, reference = self._unit(results, index, self.knobs.first), self._reference(results, index)
-        positions = made.arrays["positions"]
+        first = self.knobs.first if first is None else first
+        window = slice(first - self.knobs.first, None)
+        unit, reference = self._unit(results, index, first), self._reference(results, index)[window]
+        positions = results[f"{setting.name} {index}"].arrays["positions"][window]
         total = distance(positions, reference) / unit
         if setting.options:
             return total, math.nan, math.nan
-        companion = results[_untimed_name(self._companion(setting), index)].arrays["positions"]
+        companion = results[_untimed_name(self._companion(setting), index)].arrays["positions"][window]
         return total, distance(positions, companion) / unit, distance(companion, reference) / unit
 
     def predicted(
@@ -378,7 +422,7 @@ class Bench:
         first = max(context, self.knobs.first)
         errors, seconds = [], []
         for i in self.knobs.draws:
-            result = results[f"{one.folder} {context} {i}"]
+            result = results[f"{_model_name(one)} {context} {i}"]
             window = slice(first - context, self.knobs.last + 1 - context)
             positions, data = (result.arrays[name][window] for name in ("positions", "data"))
             truth = self._reference(results, i)[first - self.knobs.first :]
@@ -431,6 +475,11 @@ def untimed(scene_name: str, parameters: Any, level: Any, frames: int, window: s
     with threadpool_limits(1):
         trajectory = get_scene(scene_name).simulate_with(parameters, level, frames)
     return Result({}, {"positions": trajectory.positions[window]})
+
+
+def _model_name(one: Shipped) -> str:
+    """Tells the same folder with other weights apart."""
+    return f"{one.folder} {read_description(one.folder).weights_sha256[:8]}"
 
 
 def _untimed_name(level: Any, index: int) -> str:

@@ -76,7 +76,7 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         (["generate", TASK, "--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
         (["generate", TASK, "--fidelity", "best"], ["fidelity 'best'", "known: default, fast, reference"]),
         (["generate", TASK, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
-        (["generate", TASK, "--workers", "0"], ["workers must be at least 1"]),
+        (["generate", TASK, "--workers", "0"], ["0 is not in the range x>=1"]),
         (["generate", TASK, "--workers", "two"], ["'two' is not a valid integer"]),
         (["generate", TASK, "--seed", "-1"], ["--seed"]),
         ([*TRAIN, "--task", "bending"], ["task 'bending'", "known: deformable_block, falling_teddy,"]),

@@ -116,22 +116,20 @@ def test_no_order_where_nothing_converges() -> None:
 
 
 def test_pareto_front() -> None:
-    """Beaten only by what is clearly better in both; what has no error is on no front."""
-    points = [(1.0, 1.0), (2.0, 0.5), (3.0, 0.6), (2.05, 0.505), (0.5, math.inf)]
-    assert tradeoff.pareto_front(points) == [True, True, False, True, False]
+    """Beaten by what is clearly better in one respect and as good in the other; what has no error is on no front."""
+    points = [(1.0, 1.0), (10.0, 1.0), (2.0, 0.5), (3.0, 0.6), (2.05, 0.504), (1.05, 2.0), (0.5, math.inf)]
+    assert tradeoff.pareto_front(points) == [True, False, True, False, True, False, False]
 
 
 # -- the grids ---------------------------------------------------------------------------------------------
 
 
 def test_grids_are_large_enough() -> None:
-    """At least 60 cells over the five scenes, and 20 for models; names are unique."""
+    """At least 60 cells over the five scenes; names are unique."""
     grids = [extremes_of(name) for name in scene_names()]
     assert sum(len(grid.cells) for grid in grids) >= 60
     for grid in grids:
         assert len({cell.name for cell in grid.cells}) == len(grid.cells)
-    shipped = ("m3gn", "mgn", "mgn_material")
-    assert len(shipped) * len(MODEL_CELLS) >= 20
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -192,10 +190,10 @@ def test_a_model_at_its_extremes(name: str) -> None:
 def test_models_do_not_mind_where_the_scene_is() -> None:
     usual, shifted, double = (
         stability.judge_model(TASK, M3GN, name).error
-        for name in ("stiffest material", "shifted by ten scenes", "double precision")
+        for name in ("softest material of the scene", "shifted by ten scenes", "double precision")
     )
-    assert usual is not None
-    assert shifted == pytest.approx(double, rel=1e-3)
+    assert shifted == pytest.approx(usual, rel=1e-3)  # the first test trajectory is of the softest material
+    assert double == pytest.approx(usual, rel=1e-3)
 
 
 # -- commands ----------------------------------------------------------------------------------------------
@@ -226,6 +224,7 @@ def test_commands_measure_record_and_render(tmp_path: Path) -> None:
     assert len(found.pop("advice")) == 3
     assert figure.stat().st_size > 5000
     (result,), _ = read_records(docs / "studies")
+    assert result == result.with_front()
     assert found == result.model_dump(mode="json")
     assert_sound(result)
     code, found = run("stability", "deformable_block", *places)
@@ -304,11 +303,13 @@ def test_mistakes_are_explained(arguments: list[str], message: str) -> None:
 
 # -- what is on record -------------------------------------------------------------------------------------
 
+# Their default solves each step more precisely than the mesh deserves: a looser tolerance is as accurate, and faster.
+BEATEN = ("sheet_deformation", "sheet_deformation_ood", "tissue_manipulation")
 RECORDS = Path(__file__).parents[1] / "docs" / "studies"
 
 
 def test_recorded_tradeoffs() -> None:
-    """Every task has one: its default fidelity is on the front.
+    """Every task has one, with the default fidelity on the front but for what is known.
 
     References are converged but for falling bodies, where the third mesh still differs from the second by half as much
     as that from the first: thin limbs of linear tetrahedra hit the floor. The page says so.
@@ -316,10 +317,9 @@ def test_recorded_tradeoffs() -> None:
     found, _ = read_records(RECORDS)
     assert [study.task for study in found] == list(TASKS)
     for study in found:
-        default = next(s for s in study.simulators if (s.knob, s.label) == ("fidelity", "default"))
-        assert default.on_front, study.task
-        assert not default.refused
-        assert default.error
+        assert not study.default.refused
+        assert study.default.error
+        assert study.default.on_front or study.task in BEATEN, study.task
         assert is_converged(study) != study.scene.startswith(("falling", "mixed")), study.task
 
 

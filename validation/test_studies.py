@@ -31,11 +31,11 @@ def test_tradeoff(name: str, tmp_path: Path) -> None:
     some = replace(knobs, draws=draws, settings=cheap)
     result, study = tradeoff.measure(task, models, tmp_path / "state", knobs=some)
     study.finish()
-    default = next(s for s in result.simulators if s.label == "default")
+    default = result.default
     recorded = next(t for t in TRADEOFFS if t.task == name)
-    before = next(s for s in recorded.simulators if s.label == "default")
+    before = recorded.default
     print(f"{name}: default {default.error:.2%} in {default.seconds:.2f} s, {result.convergence}")
-    assert default.on_front
+    assert not default.refused
     assert default.error is not None
     assert before.error is not None
     assert before.error / 3 < default.error < 3 * before.error  # one draw of three

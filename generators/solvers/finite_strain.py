@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from skfem import Basis, Mesh
 from skfem.element import Element
 
+from m3gn_bench.generators.errors import ParameterError
 from m3gn_bench.generators.solvers.sparse import Array
 
 Setting = Literal["3d", "plane stress", "plane strain"]
@@ -50,13 +51,13 @@ class NeoHookean:
             setting: "3d", or for two-dimensional solids "plane stress" or "plane strain".
 
         Raises:
-            ValueError: a modulus outside its physical range.
+            ParameterError: a modulus outside its physical range.
         """
         E, nu = youngs_modulus, poisson_ratio
         if E <= 0:
-            raise ValueError(f"youngs_modulus must be positive, not {E}")
+            raise ParameterError(f"youngs_modulus must be positive, not {E}")
         if not -1 < nu < 0.5:
-            raise ValueError(f"poisson_ratio must lie in (-1, 0.5), not {nu}")
+            raise ParameterError(f"poisson_ratio must lie in (-1, 0.5), not {nu}")
         bulk = {
             "3d": E / (3 * (1 - 2 * nu)),
             "plane stress": E / (2 * (1 - nu)),

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from skfem import Basis, ElementQuadBFS, MeshQuad
 
+from m3gn_bench.generators.errors import ParameterError
 from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler
 
 GAUSS_POINTS = 3  # per direction; four change no scene by more than its discretisation error
@@ -45,20 +46,20 @@ class ClampedPlate:
         poisson_ratio: nu.
 
     Raises:
-        ValueError: a parameter outside its physical range.
+        ParameterError: a parameter outside its physical range.
     """
 
     def __init__(
         self, *, ticks: Array, thickness: float, youngs_modulus: float, poisson_ratio: float
     ) -> None:
         if min(thickness, youngs_modulus) <= 0:
-            raise ValueError(
+            raise ParameterError(
                 f"thickness and youngs_modulus must be positive, not {thickness}, {youngs_modulus}"
             )
         if not -1 < poisson_ratio < 0.5:
-            raise ValueError(f"poisson_ratio must lie in (-1, 0.5), not {poisson_ratio}")
+            raise ParameterError(f"poisson_ratio must lie in (-1, 0.5), not {poisson_ratio}")
         if len(ticks) < 3 or ticks[0] != 0 or np.diff(ticks).min() <= 0:
-            raise ValueError(f"ticks must be three or more numbers that increase from 0, not {ticks}")
+            raise ParameterError(f"ticks must be three or more numbers that increase from 0, not {ticks}")
         self.side = float(ticks[-1])
         self.thickness = thickness
         self.youngs_modulus = youngs_modulus
@@ -133,10 +134,12 @@ class ClampedPlate:
             Work-conjugate nodal loads over all degrees of freedom, shape [dofs].
 
         Raises:
-            ValueError: the disc does not lie inside the plate.
+            ParameterError: the disc does not lie inside the plate.
         """
         if min(centre) < radius or max(centre) > self.side - radius:
-            raise ValueError(f"a disc of radius {radius} at {centre} leaves the plate of side {self.side}")
+            raise ParameterError(
+                f"a disc of radius {radius} at {centre} leaves the plate of side {self.side}"
+            )
         corners = self.mesh.p[:, self.mesh.t]
         near = np.all(
             [

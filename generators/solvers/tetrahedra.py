@@ -17,16 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from m3gn_bench.generators.errors import ParameterError
+
 Array = NDArray[np.float64]
 
 
 def lame_constants(youngs_modulus: float, poisson_ratio: float) -> tuple[float, float]:
-    """mu and lambda [Pa] of an isotropic solid. Raises ValueError outside E > 0, 0 <= nu < 0.5.
+    """mu and lambda [Pa] of an isotropic solid. Raises ParameterError outside E > 0, 0 <= nu < 0.5.
 
     With nu < 0 this energy is lower at J = 0 than at rest, so an auxetic body would collapse.
     """
     if not (youngs_modulus > 0 and 0 <= poisson_ratio < 0.5):
-        raise ValueError(
+        raise ParameterError(
             f"youngs_modulus must be positive and poisson_ratio in [0, 0.5), not {youngs_modulus}, {poisson_ratio}"
         )
     mu = youngs_modulus / (2 * (1 + poisson_ratio))
@@ -78,7 +80,7 @@ class TetrahedralSolid:
         nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
 
     Raises:
-        ValueError: a parameter out of its physical range, or a tetrahedron without volume.
+        ParameterError: a parameter out of its physical range, or a tetrahedron without volume.
     """
 
     def __init__(
@@ -98,9 +100,9 @@ class TetrahedralSolid:
     ) -> None:
         self.mu, self.lam = lame_constants(youngs_modulus, poisson_ratio)
         if density <= 0:
-            raise ValueError(f"density must be positive, not {density}")
+            raise ParameterError(f"density must be positive, not {density}")
         if viscosity < 0 or friction < 0:
-            raise ValueError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
+            raise ParameterError(f"viscosity and friction must not be negative: {viscosity}, {friction}")
         self.density, self.viscosity, self.friction = density, viscosity, friction
         self.gravity, self.floor, self.nodal_pressure = gravity, floor, nodal_pressure
         self.vertices = np.asarray(vertices, dtype=np.float64)
@@ -111,7 +113,7 @@ class TetrahedralSolid:
         edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
         self.volumes = np.linalg.det(edges) / 6
         if not self.volumes.min() > 0:
-            raise ValueError(f"tetrahedron {self.volumes.argmin()} has volume {self.volumes.min():.3g}")
+            raise ParameterError(f"tetrahedron {self.volumes.argmin()} has volume {self.volumes.min():.3g}")
         self.inverse_edges = np.linalg.inv(edges)
         self.nodal_volumes = self.gather(np.repeat(self.volumes / 4, 4))
         self.masses = density * self.nodal_volumes
