@@ -288,9 +288,13 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
             )
         drop = found["max_force_drop"]
         if drop == 1:
-            what = "the circle does not touch the block: the contact force is 0"
+            what = "the contact force is 0: the circle punches through, has slipped off, or is not there yet"
             problems.append(
-                problem(int(found["max_force_drop_frame"]), what, "let it move onto the block's top")
+                problem(
+                    int(found["max_force_drop_frame"]),
+                    what,
+                    "let it press on the top of the block, with a larger radius",
+                )
             )
         elif drop > MAX_FORCE_DROP:
             problems.append(

@@ -119,16 +119,13 @@ def measure(
     cells = [
         Cell(
             f"simulator: {one.name}",
-            partial(_judged, task.scene, one, grid.allowed, grid.size),
+            partial(_as_result, judge, task.scene, one, grid.allowed, grid.size),
             timed=False,
         )
         for one in simulated
     ]
     cells += [
-        Cell(
-            f"{one.folder} {shas[one]}: {name}",
-            lambda o=one, n=name: Result(judge_model(task, o, n).model_dump()),
-        )  # type: ignore[misc]
+        Cell(f"{one.folder} {shas[one]}: {name}", partial(_as_result, judge_model, task, one, name))
         for one in checkpoints
         for name in MODEL_CELLS
     ]
@@ -150,9 +147,9 @@ def measure(
     ), study
 
 
-def _judged(*arguments: Any) -> Result:
+def _as_result(judging: Callable[..., Judged], *arguments: Any) -> Result:
     with threadpool_limits(1):
-        return Result(judge(*arguments).model_dump())
+        return Result(judging(*arguments).model_dump())
 
 
 # -- simulators --------------------------------------------------------------------------------------------
