@@ -107,7 +107,7 @@ def tradeoff(
                     f"{s.knob}: {s.label}",
                     "" if s.seconds is None else f"{s.seconds:.3g}",
                     *map(percent, (s.error, s.error_of_steps, s.error_of_mesh)),
-                    "yes" if s.on_front else "",
+                    "yes" if s.on_front else "by parts" if s.on_front_by_parts else "",
                     len(s.refused) or "",
                 ]
                 for s in result.simulators

@@ -49,7 +49,9 @@ class Simulated(Record):
         error_of_mesh: distance of that from the reference.
         extrapolated: the time is that of fewer frames, and of each further one.
         refused: reasons, one for every draw that the scene's checks or the solver refused.
-        on_front: no other way is better (see `pareto_front`).
+        on_front: no other way is better (see `pareto_front`) in time and error.
+        on_front_by_parts: no other setting is better in time, error of steps and error of the mesh. What a mesh changes
+            is another body, the same in all trajectories; what steps change is noise in the motion of that body.
     """
 
     knob: str
@@ -61,6 +63,7 @@ class Simulated(Record):
     extrapolated: bool = False
     refused: tuple[str, ...] = ()
     on_front: bool = False
+    on_front_by_parts: bool = False
 
 
 class Predicted(Record):
@@ -131,23 +134,31 @@ class TradeOff(Record):
         return next(s for s in self.simulators if (s.knob, s.label) == ("fidelity", "default"))
 
     def with_front(self) -> "TradeOff":
-        """The same with every way marked that lies on the front; refused settings do not."""
-        ways: list[Simulated | Predicted] = [*self.simulators, *self.models]
-        front = pareto_front(
+        """The same with every way marked that lies on a front; refused settings do not."""
+
+        def finite(value: float | None) -> float:
+            return math.inf if value is None else value
+
+        totals = [
+            (math.inf, math.inf) if s.refused else (finite(s.seconds), finite(s.error))
+            for s in self.simulators
+        ]
+        front = pareto_front([*totals, *((m.seconds, m.error) for m in self.models)])
+        parts = pareto_front(
             [
-                (math.inf, math.inf)
-                if way.seconds is None or way.error is None or (isinstance(way, Simulated) and way.refused)
-                else (way.seconds, way.error)
-                for way in ways
+                (seconds, finite(s.error_of_steps), finite(s.error_of_mesh))
+                for s, (seconds, _) in zip(self.simulators, totals, strict=True)
             ]
         )
-        marked = [way.model_copy(update={"on_front": on}) for way, on in zip(ways, front, strict=True)]
-        return self.model_copy(
-            update={
-                "simulators": tuple(way for way in marked if isinstance(way, Simulated)),
-                "models": tuple(way for way in marked if isinstance(way, Predicted)),
-            }
+        simulators = tuple(
+            s.model_copy(update={"on_front": on, "on_front_by_parts": by_parts})
+            for s, on, by_parts in zip(self.simulators, front, parts, strict=False)
         )
+        models = tuple(
+            m.model_copy(update={"on_front": on})
+            for m, on in zip(self.models, front[len(simulators) :], strict=True)
+        )
+        return self.model_copy(update={"simulators": simulators, "models": models})
 
 
 def measure(
@@ -228,15 +239,17 @@ def measure(
     ).with_front(), study
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which (seconds, error) no other is better than: clearly in one respect, and not clearly worse in the other."""
+def pareto_front(points: Sequence[tuple[float, ...]]) -> list[bool]:
+    """Which (seconds, error, ...) no other is better than: clearly in one respect, and clearly worse in none."""
 
-    def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
-        faster, better = one[0] * TIME_MARGIN < other[0], one[1] * ERROR_MARGIN < other[1]
-        slower, worse = other[0] * TIME_MARGIN < one[0], other[1] * ERROR_MARGIN < one[1]
-        return (faster and not worse) or (better and not slower)
+    def clearly_less(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+        margins = (TIME_MARGIN, *(ERROR_MARGIN for _ in one[1:]))
+        return any(a * margin < b for a, b, margin in zip(one, other, margins, strict=True))
 
-    return [math.isfinite(p[1]) and not any(beats(other, p) for other in points) for p in points]
+    def beats(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+        return clearly_less(one, other) and not clearly_less(other, one)
+
+    return [math.isfinite(sum(p)) and not any(beats(other, p) for other in points) for p in points]
 
 
 def observed_order(cell_sizes: Sequence[float], distances: tuple[float, float]) -> float | None:

@@ -35,7 +35,7 @@ def test_tradeoff(name: str, tmp_path: Path) -> None:
     recorded = next(t for t in TRADEOFFS if t.task == name)
     before = recorded.default
     print(f"{name}: default {default.error:.2%} in {default.seconds:.2f} s, {result.convergence}")
-    assert not default.refused
+    assert default.on_front_by_parts
     assert default.error is not None
     assert before.error is not None
     assert before.error / 3 < default.error < 3 * before.error  # one draw of three
