@@ -310,8 +310,8 @@ RECORDS = Path(__file__).parents[1] / "docs" / "studies"
 def test_recorded_tradeoffs() -> None:
     """Every task has one, with the default fidelity on the front where steps and mesh count each for itself.
 
-    References are converged but for falling bodies, where the third mesh still differs from the second by two thirds as much
-    as that from the first: thin limbs of linear tetrahedra hit the floor. The page says so.
+    References are converged but for falling bodies, where the third mesh still differs from the second by two thirds
+    as much as that from the first: thin limbs of linear tetrahedra hit the floor. The page says so.
     """
     found, _ = read_records(RECORDS)
     assert [study.task for study in found] == list(TASKS)
