@@ -123,7 +123,7 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
     plane: Plane = "stress"
 
     name: ClassVar[str] = "deformable_block"
-    dataset_version: ClassVar[str] = "2.0"
+    dataset_version: ClassVar[str] = "3.0"
     tasks: ClassVar[tuple[str, ...]] = ("deformable_block",)
     paper_sizes: ClassVar[dict[Split, int]] = {"train": 675, "validation": 135, "test": 135}
     frames: ClassVar[int] = RECORDED_FRAMES
@@ -135,8 +135,8 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
     scale_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0)
     scale_length: ClassVar[float] = 100.0
     fidelities: ClassVar[dict[str, BlockFidelity]] = {
-        "fast": BlockFidelity(8, 1, (4, 2, 2), 1, 1e-3),
-        "default": BlockFidelity(8, 1, (16, 8, 8, 4, 4, 4, 2, 2, 2, 2), 1, 1e-3),
+        "fast": BlockFidelity(8, 1, (4, 2, 2), 1, 1e-2),
+        "default": BlockFidelity(8, 1, (16, 8, 8, 4, 4, 4, 2, 2, 2, 2), 1, 1e-2),
         "reference": BlockFidelity(16, 2, (32, 16, 16, 8, 8, 8, 4, 4, 4, 4), 2, 1e-7),
     }
 

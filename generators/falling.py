@@ -92,7 +92,7 @@ class _FallingObjects(Leveled, SingleTask):
     name: ClassVar[str]
     tasks: ClassVar[tuple[str, ...]]
     paper_sizes: ClassVar[dict[Split, int]]
-    dataset_version: ClassVar[str] = "1.0"
+    dataset_version: ClassVar[str] = "2.0"
     frames: ClassVar[int] = TRANSITIONS + 1
     dt: ClassVar[float] = FRAME_TIME
     time_unit: ClassVar[str] = "s"
@@ -102,8 +102,10 @@ class _FallingObjects(Leveled, SingleTask):
     scale_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.5)
     scale_length: ClassVar[float] = 0.5
     fidelities: ClassVar[dict[str, FallFidelity]] = {
-        "fast": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40),
-        "default": FallFidelity(refinements=0, courant=0.7, vbd_iterations=2, vbd_substeps=160),
+        "fast": FallFidelity(
+            refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40, nodal_pressure=False
+        ),
+        "default": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=160),
         "reference": FallFidelity(refinements=1, courant=0.35, vbd_iterations=5, vbd_substeps=160),
     }
 
