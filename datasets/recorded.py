@@ -19,7 +19,7 @@ from m3gn_bench.datasets.file import (
     tier_hashes,
 )
 from m3gn_bench.datasets.schema import SMALL_TIERS, Record, in_tier
-from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.datasets.trajectory import FREE, Trajectory
 from m3gn_bench.datasets.writer import write_bytes_atomically
 
 FOLDER = Path(__file__).parent / "recorded"
@@ -68,10 +68,11 @@ class Reproduction(Record):
 
 
 def probe(trajectory: Trajectory) -> tuple[float, ...]:
-    """Coordinates of a few nodes in a few frames, the last one among them, in physical units."""
-    frames, nodes, _ = trajectory.positions.shape
+    """Coordinates of a few free nodes in a few frames, the last one among them, in physical units."""
+    frames = len(trajectory.positions)
+    free = np.flatnonzero(trajectory.mesh.node_type == FREE)
     chosen_frames = np.linspace(0, frames - 1, PROBED_FRAMES + 1, dtype=int)[1:]
-    chosen_nodes = np.linspace(0, nodes - 1, PROBED_NODES + 2, dtype=int)[1:-1]
+    chosen_nodes = free[np.linspace(0, len(free) - 1, PROBED_NODES + 2, dtype=int)[1:-1]]
     return tuple(trajectory.positions[np.ix_(chosen_frames, chosen_nodes)].ravel().tolist())
 
 

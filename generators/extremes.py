@@ -192,6 +192,7 @@ def _falling_cells(scene: Any, usual: Any, kinds: dict[str, dict[str, Any]]) -> 
     from m3gn_bench.generators.falling import flight_frames
 
     default = scene.fidelities["default"]
+    reference = replace(default, refinements=1, courant=0.35)
     cells = []
     for name, kind in kinds.items():
         changes = dict(kind)
@@ -199,7 +200,6 @@ def _falling_cells(scene: Any, usual: Any, kinds: dict[str, dict[str, Any]]) -> 
         frames, options = changes.pop("frames", None), changes.pop("options", {})
         parameters = replace(usual, **changes)
         first = flight_frames(parameters.height)
-        reference = replace(default, refinements=1, courant=0.35, nodal_pressure=level.nodal_pressure)
         cells.append(Extreme(name, parameters, level, frames, first, first + 19, reference, options))
     return tuple(cells)
 
@@ -232,7 +232,7 @@ def _falling_teddy() -> Extremes:
                 "upside down": {"orientation": UPSIDE_DOWN},
                 "lowest fidelity": {"level": FallingTeddy.fidelities["fast"], **stiff},
                 "a step beyond the limit of stability": {"level": replace(default, courant=1.5), **stiff},
-                "an eighth of the step": {"level": replace(default, courant=0.7 / 8), **stiff},
+                "an eighth of the step": {"level": replace(default, courant=default.courant / 8), **stiff},
                 "single precision (newton-vbd)": {
                     "level": single,
                     "options": {"solver": "newton-vbd"},

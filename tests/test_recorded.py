@@ -123,6 +123,14 @@ def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
     assert len(found.probes) == 96
 
 
+@pytest.mark.parametrize("scene", scene_names())
+def test_recorded_probes_tell_trajectories_apart(scene: str) -> None:
+    """Nodes that never move, such as clamped ones, would compare equal whatever was simulated."""
+    probes = np.array(list(read_record(scene).probes.values()))
+    moving = (np.ptp(probes, axis=0) > 1e-3).mean()
+    assert moving > 0.6, f"{1 - moving:.0%} of the probed coordinates are the same in all trajectories"
+
+
 def test_reproduce_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From nothing, against a record of other data: exit code 1. (CI runs it against the good ones.)"""
     record(altered(quick_file, tmp_path, 1e-2), tmp_path)

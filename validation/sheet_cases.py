@@ -12,6 +12,7 @@ from m3gn_bench.generators.sheet_deformation import (
     NODES_PER_SIDE,
     SIDE,
     SheetDeformation,
+    SheetFidelity,
     SheetParameters,
 )
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
@@ -29,10 +30,15 @@ def case(youngs_modulus: float, forces: tuple[float, float]) -> SheetParameters:
     return SheetParameters(youngs_modulus=youngs_modulus, centres=CENTRES, forces=forces)
 
 
-@lru_cache
 def displacements(parameters: SheetParameters, fidelity: Fidelity = "default") -> Array:
     """Displacements [mm] of the recorded nodes as the scene writes them, shape [frames, nodes, 3]."""
-    trajectory = SheetDeformation().simulate(parameters, fidelity)
+    return displacements_with(parameters, SheetDeformation.fidelities[fidelity])
+
+
+@lru_cache
+def displacements_with(parameters: SheetParameters, level: SheetFidelity) -> Array:
+    """The same with a discretisation of one's own."""
+    trajectory = SheetDeformation().simulate_with(parameters, level)
     return trajectory.positions.astype(np.float64) - trajectory.mesh.rest_positions
 
 

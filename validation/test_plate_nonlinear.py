@@ -1,5 +1,7 @@
 """Large deflections: exact derivatives, indifference to rotation, convergence in mesh, steps, tolerance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,7 @@ from sheet_cases import (
     at_recorded_nodes,
     case,
     displacements,
+    displacements_with,
     equilibria,
     relative_error,
     worst_frame_error,
@@ -142,7 +145,7 @@ def test_load_increments_leave_no_trace(youngs_modulus: float) -> None:
 
     Two states with residuals below tol |f| differ by at most 2 tol |f| / lambda_min(K), to first order.
     """
-    tolerance = SheetDeformation.fidelities["default"].tolerance
+    tolerance = 1e-6
     parameters = case(youngs_modulus, SAME)
     plate, load, states = equilibria(parameters, refinement=1, tolerance=tolerance, increments=INCREMENTS)
     _, _, halved = equilibria(parameters, refinement=1, tolerance=tolerance, increments=2 * INCREMENTS)
@@ -165,15 +168,14 @@ def _smallest_eigenvalue(plate: ClampedPlate, x: Array) -> float:
     return 1 / float(np.linalg.norm(vector))
 
 
-@pytest.mark.parametrize(("fidelity", "allowed"), [("fast", 1e-3), ("default", 1e-5)])
+@pytest.mark.parametrize(("fidelity", "allowed"), [("fast", 1e-3), ("default", 1e-4)])
 @pytest.mark.parametrize("youngs_modulus", [10.0, 100.0, 1000.0])
 def test_newtons_tolerance_is_small_enough(youngs_modulus: float, fidelity: Fidelity, allowed: float) -> None:
-    """`fast` is within 0.1 % of tightly converged states on its mesh, `default` within 0.001 %.
+    """`fast` is within 0.1 % of tightly converged states on its mesh, `default` within 0.01 %.
 
-    So what `default` leaves undone is less than a tenth of the smallest error that its mesh makes (0.02 %).
+    So what `default` leaves undone is less than half of the smallest error that its mesh makes (0.02 %).
     """
     parameters = case(youngs_modulus, SAME)
-    plate, _, states = equilibria(parameters, refinement=1, tolerance=1e-9, increments=INCREMENTS)
-    tight = at_recorded_nodes(plate.mesh.p.T, plate.displacements(states))
+    tight = displacements_with(parameters, replace(SheetDeformation.fidelities[fidelity], tolerance=1e-9))
     error = relative_error(displacements(parameters, fidelity), tight)
     assert error < allowed, f"{fidelity} is off by {error:.1e}"
