@@ -86,7 +86,7 @@ def _sheet_deformation() -> Knobs:
         size=None,
         settings=(
             *_fidelities(SheetDeformation),
-            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-6)),
+            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-4)),
             Setting("mesh", "even, 14 x 14", replace(default, border_layer=False)),
             Setting("mesh", "even, 28 x 28", replace(default, border_layer=False, refinement=2)),
             Setting("mesh", "32 x 32", replace(default, refinement=2)),

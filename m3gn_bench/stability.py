@@ -174,14 +174,14 @@ def judge(scene_name: str, cell: "Extreme", allowed: float, size: float | None) 
             return judged("refused", detail=reason)
         return judged("wrong", detail=f"refused without frame, quantity or remedy: {reason}")
 
-    scene = get_scene(scene_name, **cell.options)
     try:
+        scene = get_scene(scene_name, **cell.options)
         trajectory = scene.simulate_with(cell.parameters, cell.level, cell.frames)
     except ParameterError as error:  # before the first step; the message says what is allowed
         return refused(problem(0, str(error), "choose a value that is allowed"))
     except SolverError as error:
         return refused(str(error))
-    except GeneratorError as error:  # of a name; the message lists what exists
+    except GeneratorError as error:  # of a name, or a library; the message says what exists, or how to install it
         return refused(problem(0, str(error), "choose one that exists"))
     problems = scene.check(trajectory)
     if problems:

@@ -297,6 +297,7 @@ class Bench:
         self.task, self.scene, self.knobs = task, scene, knobs
         self.machine = machine()
         self.parameters = {i: draw(scene, "test", i, DATASET_SEED) for i in knobs.draws}
+        self._simulated: dict[int, Any] = {}
 
     # -- measuring -------------------------------------------------------------------------------------
 
@@ -367,6 +368,12 @@ class Bench:
             seconds.append(time.process_time() - start)
         return min(seconds), trajectory
 
+    def _data(self, index: int) -> Any:
+        """The dataset's trajectory, simulated when the first model asks for it."""
+        if index not in self._simulated:
+            self._simulated[index] = self.scene.simulate(self.parameters[index], "default")
+        return self._simulated[index]
+
     def _window(self, positions: np.ndarray) -> np.ndarray:
         return positions[self.knobs.first : self.knobs.last + 1]
 
@@ -375,7 +382,7 @@ class Bench:
         import torch
 
         model, _ = load_checkpoint(one.folder)
-        data = self.scene.simulate(self.parameters[index], "default")
+        data = self._data(index)
         case = case_from(self.task, self.scene, data, trajectory_key("test", index))
         seen = case.context(context)
         seconds = []
