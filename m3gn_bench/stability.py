@@ -181,7 +181,9 @@ def judge(scene_name: str, cell: "Extreme", allowed: float, size: float | None) 
         return refused(problem(0, str(error), "choose a value that is allowed"))
     except SolverError as error:
         return refused(str(error))
-    except GeneratorError as error:  # of a name, or a library; the message says what exists, or how to install it
+    except (
+        GeneratorError
+    ) as error:  # of a name, or a library; the message says what exists, or how to install it
         return refused(problem(0, str(error), "choose one that exists"))
     problems = scene.check(trajectory)
     if problems:

@@ -22,7 +22,8 @@ ALLOWED = {
     "leaderboard": {"leaderboard", "m3gn_bench", "version", "datasets"},
 }
 # These reach further, but only inside functions: a model can be evaluated without a simulator installed.
-LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", "sources", "stability", "study_commands", "tradeoff")}
+COMMANDS = ("dataset_commands", "leaderboard_commands", "model_commands", "study_commands")
+LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", *COMMANDS, "sources", "stability", "tradeoff")}
 LAZILY_ALLOWED = {"generators", "leaderboard", "baselines"}
 
 

@@ -1,0 +1,485 @@
+"""The commands that train, score and time models; part of the command line (see `cli`)."""
+
+import os
+import subprocess
+import time
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from m3gn_bench.console import DATA, JSON, WORKERS, Report, table
+from m3gn_bench.version import __version__
+
+if TYPE_CHECKING:
+    from m3gn_bench.profiling import Profile, Ratios
+
+THREADS = click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    default=os.cpu_count() or 1,
+    help="Of torch.  [default: all cores]",
+)
+
+
+@click.command()
+@click.option("--task", required=True, help="What to train on.")
+@click.option("--model", required=True, help="Which model.")
+@click.option("--preset", default="compact", show_default=True, help="smoke, compact or paper.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and sampling."
+)
+@click.option("--minutes", type=float, default=None, help="Budget: CPU minutes of training steps.")
+@click.option("--steps", type=int, default=None, help="Budget: optimiser steps.")
+@click.option("--tier", default="paper", show_default=True, help="Which data.")
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the run."
+)
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Override a preset's value.")
+@click.option(
+    "--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of torch, on the CPU."
+)
+@click.option("--device", default="cpu", show_default=True, help="A torch device.")
+@click.option("--tensorboard", is_flag=True, help="Write curves to the run's folder.")
+@WORKERS
+@DATA
+@JSON
+def train(
+    task: str,
+    model: str,
+    preset: str,
+    seed: int,
+    minutes: float | None,
+    steps: int | None,
+    tier: str,
+    out: Path,
+    settings: tuple[str, ...],
+    threads: int,
+    device: str,
+    tensorboard: bool,
+    workers: int,
+    data: Path,
+    as_json: bool,
+) -> None:
+    """Train a model and leave a checkpoint. A run that was interrupted goes on where it stopped."""
+    from m3gn_bench.data import load_cases
+    from m3gn_bench.datasets.file import content_hash, open_file
+    from m3gn_bench.model import build_model, load_preset
+    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.tasks import get_task
+    from m3gn_bench.training import Progress, require_budget, tensorboard_observer, usable_device
+    from m3gn_bench.training import train as train_model
+
+    report = Report(as_json)
+    spec = get_task(task)
+    overrides = _parse_settings(settings)
+    overrides |= {f"training.{k}": v for k, v in (("minutes", minutes), ("steps", steps)) if v is not None}
+    config = load_preset(model, preset, spec, overrides)
+    # Whatever can be refused is refused before data are simulated.
+    require_budget(config, build_model(config, spec).is_learned)
+    usable_device(device)
+    curves = tensorboard_observer(out) if tensorboard else None
+    with report.progress(f"simulating {spec.scene}") as on_progress:
+        path = find_or_generate(
+            spec, tier, data, splits=("train", "validation"), workers=workers, on_progress=on_progress
+        )
+    with open_file(path) as file:
+        dataset_hash = content_hash(file, tier, ("train", "validation"))
+    training, validation = (load_cases(path, spec, split, tier) for split in ("train", "validation"))
+    with report.progress(f"training {model}") as on_progress:
+
+        def observe(progress: Progress) -> None:
+            on_progress(round(1000 * progress.fraction), 1000)
+            if curves:
+                curves(progress)
+
+        done = train_model(
+            config,
+            spec,
+            training,
+            validation,
+            out,
+            seed=seed,
+            dataset_hash=dataset_hash,
+            device=device,
+            threads=threads,
+            observe=observe,
+        )
+    error = (
+        "none" if done.validation_error is None else f"{done.validation_error:.4g} (step {done.best_step})"
+    )
+    report.finish(
+        {"checkpoint": str(out), **done.model_dump(mode="json")},
+        f"checkpoint        {out}",
+        f"steps             {done.steps} in {done.minutes:.1f} min",
+        f"validation error  {error}",
+    )
+
+
+def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """Values of --set, in TOML's notation."""
+    values: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        try:
+            (values[key.strip()],) = tomllib.loads(f"value = {text}").values()
+        except (tomllib.TOMLDecodeError, ValueError):
+            raise click.BadParameter(
+                f"{setting!r} is no KEY=VALUE with a TOML value, e.g. training.learning_rate=1e-3"
+            ) from None
+        if not equals:
+            raise click.BadParameter(f"{setting!r} has no '='")
+    return values
+
+
+@click.command()
+@click.option("--model", required=True, help="Which model.")
+@click.option(
+    "--task", "task_name", default=None, help="Which task.  [default: all with a shipped checkpoint]"
+)
+@click.option("--tier", default="quick", show_default=True, help="Which test trajectories.")
+@click.option("--preset", default="compact", show_default=True, help="Which shipped checkpoint.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which shipped checkpoint."
+)
+@click.option(
+    "--checkpoint",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=None,
+    help="A training run's folder.  [default: the checkpoint that ships with the project]",
+)
+@click.option("--contexts", default=None, help="Context sizes, e.g. 2,5,10.  [default: the task's]")
+@click.option("--split", default="test", show_default=True, help="train, validation or test.")
+@click.option("--track", default="compact", show_default=True, help="Leaderboard track for --record.")
+@click.option(
+    "--record",
+    "record_home",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=None,
+    help="Also write a result record below this folder (in a checkout: leaderboard).",
+)
+@THREADS
+@WORKERS
+@DATA
+@JSON
+def evaluate(
+    model: str,
+    task_name: str | None,
+    tier: str,
+    preset: str,
+    seed: int,
+    checkpoint: Path | None,
+    contexts: str | None,
+    split: str,
+    track: str,
+    record_home: Path | None,
+    threads: int,
+    workers: int,
+    data: Path,
+    as_json: bool,
+) -> None:
+    """Score a model over context sizes, beside the number on the leaderboard.
+
+    Test trajectories are simulated first if they are not there yet.
+    """
+    from m3gn_bench.checkpoint import load_checkpoint, read_description
+    from m3gn_bench.cpu import use_cpu
+    from m3gn_bench.data import load_cases
+    from m3gn_bench.datasets.file import content_hash, open_file, stored_hashes
+    from m3gn_bench.datasets.schema import as_split
+    from m3gn_bench.errors import CheckpointError, ConfigError
+    from m3gn_bench.evaluation import evaluate_model
+    from m3gn_bench.leaderboard.record import (
+        HASH_DIGITS,
+        ContextResult,
+        ResultRecord,
+        checkpoint_folder,
+        find_record,
+        read_records,
+        write_record,
+    )
+    from m3gn_bench.model import get_model_class, model_names
+    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.tasks import TASKS, get_task
+
+    report = Report(as_json)
+    use_cpu(threads)
+    get_model_class(model)
+    part = as_split(split)
+    sizes = None if contexts is None else _parse_contexts(contexts)
+    if record_home is not None and (part != "test" or sizes is not None):
+        raise ConfigError("--record takes the test split at the task's own context sizes")
+    if checkpoint is not None:
+        described = read_description(checkpoint)
+        if described.config.model_name != model:
+            raise CheckpointError(f"{checkpoint} holds a {described.config.model_name}, not a {model}")
+        if task_name not in (None, described.task):
+            raise CheckpointError(f"{checkpoint} was trained on {described.task}, not on {task_name}")
+        folders = {described.task: checkpoint}
+    else:
+        names = list(TASKS) if task_name is None else [get_task(task_name).name]
+        folders = {name: checkpoint_folder(name, model, preset, seed) for name in names}
+        if task_name is None:
+            folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
+        missing = [name for name, folder in folders.items() if not folder.is_dir()]
+        if missing or not folders:
+            raise CheckpointError(
+                f"no checkpoint of {model} (preset {preset}, seed {seed}) ships with the project"
+                f"{f' for {missing[0]}' if missing else ''}; train one and pass --checkpoint. "
+                f"Models: {', '.join(model_names())}"
+            )
+
+    recorded = read_records()
+    rows: list[dict[str, Any]] = []
+    for name, folder in folders.items():
+        task = get_task(name)
+        loaded, described = load_checkpoint(folder)
+        with report.progress(f"simulating {task.scene}") as on_progress:
+            path = find_or_generate(
+                task,
+                tier,
+                data,
+                splits=(part,),
+                workers=workers,
+                on_progress=on_progress,
+            )
+        cases = load_cases(path, task, part, tier)
+        start = time.perf_counter()
+        with report.progress(f"evaluating {name}") as on_progress:
+            errors = evaluate_model(loaded, cases, sizes or task.context_sizes, on_progress)
+        seconds = time.perf_counter() - start
+        results = [ContextResult.from_errors(context, e) for context, e in errors.items()]
+        keys = tuple(case.keys[0] for case in cases)
+        with open_file(path) as file:
+            dataset_hash = content_hash(file, tier, (part,))
+            hashes = stored_hashes(file)
+        record = ResultRecord(
+            track=track,
+            task=name,
+            model=model,
+            preset=described.config.preset,
+            seed=described.seed,
+            parameters=loaded.parameter_count(),
+            tier=tier,
+            split=split,
+            dataset_hash=dataset_hash,
+            keys=keys,
+            trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),
+            package_version=__version__,
+            commit=_commit(),
+            evaluation_device="cpu",
+            evaluation_seconds=seconds,
+            checkpoint=described,
+            results=tuple(results),
+        )
+        if record_home is not None:
+            write_record(record, record_home)
+        reference = find_record(recorded, name, model, record.preset, record.seed)
+        rows += [
+            {
+                "task": name,
+                "model": model,
+                "preset": record.preset,
+                "seed": record.seed,
+                "context": r.context,
+                "mse": r.mse,
+                "mse_free_nodes": r.mse_free_nodes,
+                "ci95": r.ci95,
+                "per_timestep_mse": r.per_timestep_mse,
+                "trajectories": len(keys),
+                "recorded_mse": reference.mse_over(r.context, keys)
+                if reference and split == "test"
+                else None,
+            }
+            for r in results
+        ]
+    report.finish(
+        {"model": model, "tier": tier, "split": split, "results": rows},
+        table(
+            f"{model}: full-rollout MSE x 1e6, {split} split",
+            [
+                "task",
+                "context",
+                "mse",
+                "95 % interval",
+                "free nodes",
+                "trajectories",
+                "recorded",
+                "difference",
+            ],
+            [
+                [
+                    row["task"],
+                    row["context"],
+                    f"{row['mse'] * 1e6:.4g}",
+                    f"{row['ci95'][0] * 1e6:.3g} .. {row['ci95'][1] * 1e6:.3g}",
+                    f"{row['mse_free_nodes'] * 1e6:.4g}",
+                    row["trajectories"],
+                    *(
+                        ("none", "")
+                        if row["recorded_mse"] is None
+                        else (
+                            f"{row['recorded_mse'] * 1e6:.4g}",
+                            f"{row['mse'] / row['recorded_mse'] - 1:+.1e}",
+                        )
+                    ),
+                ]
+                for row in rows
+            ],
+        ),
+    )
+
+
+def _parse_contexts(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise click.BadParameter(f"--contexts {text!r} is no list of numbers such as 2,5,10") from None
+
+
+@click.command()
+@click.option("--task", "task_name", required=True, help="What to predict.")
+@click.option(
+    "--model", "models", required=True, multiple=True, help="Which model (may be given several times)."
+)
+@click.option("--preset", default="paper", show_default=True, help="smoke, compact or paper.")
+@click.option("--context", type=int, default=None, help="Context frames.  [default: the task's fewest]")
+@click.option("--tier", default="smoke", show_default=True, help="Which test trajectories.")
+@click.option(
+    "--trajectories", type=click.IntRange(min=1), default=4, show_default=True, help="How many of them."
+)
+@click.option(
+    "--repetitions", type=click.IntRange(min=1), default=5, show_default=True, help="Of every timing."
+)
+@click.option("--device", default="cpu", show_default=True, help="A torch device.")
+@THREADS
+@WORKERS
+@DATA
+@JSON
+def profile(
+    task_name: str,
+    models: tuple[str, ...],
+    preset: str,
+    context: int | None,
+    tier: str,
+    trajectories: int,
+    repetitions: int,
+    device: str,
+    threads: int,
+    workers: int,
+    data: Path,
+    as_json: bool,
+) -> None:
+    """Time and memory that predictions take, beside M3GN's in the same run.
+
+    One trajectory at a time, and in the batches that take least time per trajectory. Models are untrained: time
+    does not depend on how good their weights are. Test trajectories are simulated first if they are not there yet.
+    """
+    import torch
+
+    from m3gn_bench.cpu import use_cpu
+    from m3gn_bench.data import load_cases
+    from m3gn_bench.model import get_model_class
+    from m3gn_bench.profiling import profile_models, ratios
+    from m3gn_bench.published import published_parameters
+    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.tasks import get_task
+    from m3gn_bench.training import usable_device
+
+    report = Report(as_json)
+    use_cpu(threads)
+    task = get_task(task_name)
+    for name in models:
+        get_model_class(name)
+    where = usable_device(device)
+    with report.progress(f"simulating {task.scene}") as on_progress:
+        path = find_or_generate(
+            task, tier, data, splits=("train", "test"), workers=workers, on_progress=on_progress
+        )
+    cases = load_cases(path, task, "test", tier)[:trajectories]
+    frames = task.context_sizes[0] if context is None else context
+    with report.progress("profiling") as on_progress:
+        profiles = profile_models(
+            models,
+            task,
+            preset,
+            cases,
+            frames,
+            training_cases=lambda: load_cases(path, task, "train", tier),
+            repetitions=repetitions,
+            device=where,
+            on_progress=on_progress,
+        )
+    compared = list(zip(profiles, ratios(profiles), strict=True))
+
+    def row(label: str, number: "Callable[[Profile, Ratios], str]") -> list[object]:
+        return [label, *(number(p, r) for p, r in compared)]
+
+    report.finish(
+        {
+            "task": task.name,
+            "preset": preset,
+            "context": frames,
+            "tier": tier,
+            "trajectories": len(cases),
+            "repetitions": repetitions,
+            "device": device,
+            "threads": threads,
+            "torch": torch.__version__,
+            "models": [
+                asdict(p)
+                | {
+                    "ratios": asdict(r),
+                    "published_parameters": published_parameters(task.name, p.model, preset),
+                }
+                for p, r in compared
+            ],
+        },
+        table(
+            f"{task.title}, context {frames}, preset {preset}, {device}, {threads} thread(s): per trajectory",
+            ["", *(p.model for p in profiles)],
+            [
+                row("one at a time: context encoding [s]", lambda p, r: f"{p.single.encoding:.4f}"),
+                row("one at a time: simulation [s]", lambda p, r: f"{p.single.simulation:.4f}"),
+                row("one at a time: total [s]", lambda p, r: f"{p.single.total:.4f}"),
+                row(
+                    "    fastest .. slowest", lambda p, r: f"{p.single.fastest:.4f} .. {p.single.slowest:.4f}"
+                ),
+                row("    over M3GN's", lambda p, r: f"{r.single:.2f}"),
+                row("batched: trajectories at once", lambda p, r: str(p.batched.batch)),
+                row("batched: context encoding [s]", lambda p, r: f"{p.batched.encoding:.4f}"),
+                row("batched: simulation [s]", lambda p, r: f"{p.batched.simulation:.4f}"),
+                row("batched: total [s]", lambda p, r: f"{p.batched.total:.4f}"),
+                row(
+                    "    fastest .. slowest",
+                    lambda p, r: f"{p.batched.fastest:.4f} .. {p.batched.slowest:.4f}",
+                ),
+                row("    over M3GN's", lambda p, r: f"{r.batched:.2f}"),
+                row("operations [Gflop]", lambda p, r: f"{p.operations / 1e9:.2f}"),
+                row("    over M3GN's", lambda p, r: f"{r.operations:.2f}"),
+                row("peak memory of tensors [MB]", lambda p, r: f"{p.peak_memory / 1e6:.1f}"),
+                row("parameters", lambda p, r: str(p.parameters)),
+            ],
+        ),
+    )
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
+    checkout = Path(__file__).parents[1]
+    if not (checkout / "pyproject.toml").is_file():
+        return None
+    git = ["git", "-C", str(checkout)]
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        # Records and checkpoints are what is being made: they change no number.
+        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/LEADERBOARD.md"]
+        status = subprocess.run(
+            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")
