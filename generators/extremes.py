@@ -208,7 +208,7 @@ def _falling_teddy() -> Extremes:
     from m3gn_bench.generators.falling import SIZE, FallingTeddy, FallParameters
 
     default = FallingTeddy.fidelities["default"]
-    single = replace(default, nodal_pressure=False)
+    single = replace(default, element="linear")
     stiff = {
         "youngs_modulus": 1e6,
         "poisson_ratio": 0.499,

@@ -26,7 +26,7 @@ from m3gn_bench.generators.errors import (
 )
 from m3gn_bench.generators.objects import SoftBody, load_object
 from m3gn_bench.generators.scene import Leveled, SingleTask
-from m3gn_bench.generators.solvers.tetrahedra import TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Element, TetrahedralSolid
 
 if TYPE_CHECKING:  # it loads Warp
     from m3gn_bench.generators.solvers.captured import CapturedSolid
@@ -72,15 +72,14 @@ class FallFidelity:
         courant: the explicit solver's step in units of its limit of stability at rest.
         vbd_iterations: sweeps of vertex block descent per substep.
         vbd_substeps: its substeps per frame.
-        nodal_pressure: average the volume ratio over nodes (the explicit solver only); plain linear tetrahedra
-            lock as nu approaches 0.5.
+        element: of the explicit solver, see `solvers.tetrahedra`; vertex block descent has linear tetrahedra.
     """
 
     refinements: int
     courant: float
     vbd_iterations: int
     vbd_substeps: int
-    nodal_pressure: bool = True
+    element: Element = "nodal pressure"
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class _FallingObjects(Leveled, SingleTask):
     scale_length: ClassVar[float] = 0.5
     fidelities: ClassVar[dict[str, FallFidelity]] = {
         "fast": FallFidelity(
-            refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40, nodal_pressure=False
+            refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40, element="linear"
         ),
         "default": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=160),
         "reference": FallFidelity(refinements=1, courant=0.35, vbd_iterations=5, vbd_substeps=160),
@@ -167,8 +166,8 @@ class _FallingObjects(Leveled, SingleTask):
         for halving in range(MAX_HALVINGS + 1):
             try:
                 motion = solid.run(
-                    start + down / 2 * times[-1] ** 2,
-                    np.tile(down * times[-1], (len(start), 1)),
+                    solid.vertices + down / 2 * times[-1] ** 2,
+                    np.tile(down * times[-1], (solid.nodes, 1)),
                     first_frame=len(times) - 1,
                     frames=frames - len(times),
                     frame_time=FRAME_TIME,
@@ -293,7 +292,7 @@ class _FallingObjects(Leveled, SingleTask):
             return body, level.vbd_substeps
         from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 
-        solid = ExplicitSolid(start, tetrahedra, nodal_pressure=level.nodal_pressure, **scene)
+        solid = ExplicitSolid(start, tetrahedra, element=level.element, **scene)
         return solid, solid.substeps(FRAME_TIME, level.courant)
 
 

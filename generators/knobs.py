@@ -197,7 +197,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
         return replace(level, courant=0.175 * 2**level.refinements)
 
     def sweeps(iterations: int, substeps: int) -> Setting:
-        level = replace(default, vbd_iterations=iterations, vbd_substeps=substeps, nodal_pressure=False)
+        level = replace(default, vbd_iterations=iterations, vbd_substeps=substeps, element="linear")
         label = f"newton-vbd, {iterations} x {substeps}"
         return Setting("solver", label, level, {"solver": "newton-vbd"})
 
@@ -214,7 +214,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
                 for c in (0.7, 0.35, 0.175)
             ),
             Setting("mesh", "each tetrahedron in eight", replace(default, refinements=1)),
-            Setting("element", "without nodal pressure", replace(default, nodal_pressure=False)),
+            Setting("element", "without nodal pressure", replace(default, element="linear")),
             *(sweeps(*numbers) for numbers in ((10, 10), (2, 40), (2, 80))),
         ),
         meshes=tuple(fine(replace(default, refinements=k)) for k in (0, 1, 2)),

@@ -36,6 +36,7 @@ from m3gn_bench.generators.meshes.geometry import (
     reference_step,
     surface_nodes_first,
 )
+from m3gn_bench.generators.solvers.tetrahedra import EDGES
 
 MESHES = Path(__file__).parent / "meshes"
 HASHES = "hashes.json"  # beside the meshes
@@ -60,7 +61,6 @@ OWN_STEP, OWN_SUBSTEPS = 5e-4, 20  # the smallest of our own objects, and what i
 
 # Red refinement: the edges' midpoints are the nodes 4..9 of a cell. Four cells keep a corner each; the
 # octahedron between them is cut along one of its diagonals, around which the other midpoints form a ring.
-EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 CORNER_CELLS = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
 DIAGONALS = np.array([[4, 9], [5, 8], [6, 7]])
 RINGS = np.array([[5, 7, 8, 6], [4, 7, 9, 6], [4, 5, 9, 8]])

@@ -1,6 +1,6 @@
 """The explicit solver against closed forms, conservation laws and its own energy."""
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import lame_constants
+from m3gn_bench.generators.solvers.tetrahedra import Element, lame_constants
 
 MATERIAL = {"density": 1000.0, "youngs_modulus": 2e5, "poisson_ratio": 0.4}
 
@@ -31,13 +31,13 @@ def deformed(vertices: np.ndarray, amount: float = 0.1) -> np.ndarray:
     return vertices + 0.3 * amount * bend
 
 
-@pytest.mark.parametrize("nodal_pressure", [True, False])
-def test_force_is_the_energys_gradient(nodal_pressure: bool) -> None:
-    body = solid(nodal_pressure=nodal_pressure, gravity=0.0)
+@pytest.mark.parametrize("element", get_args(Element))
+def test_force_is_the_energys_gradient(element: Element) -> None:
+    body = solid(element=element, gravity=0.0)
     x = deformed(body.vertices)
     force = body.accelerations(x, np.zeros_like(x)) * body.masses[:, None]
     h = 1e-6
-    for node, axis in [(0, 0), (5, 1), (13, 2), (20, 0)]:
+    for node, axis in [(0, 0), (5, 1), (13, 2), (20, 0), (body.nodes - 1, 1)]:
         shifted = [x.copy(), x.copy()]
         shifted[0][node, axis] += h
         shifted[1][node, axis] -= h
@@ -47,7 +47,7 @@ def test_force_is_the_energys_gradient(nodal_pressure: bool) -> None:
 
 def test_lame_constants_are_those_of_small_strain() -> None:
     """Uniaxial strain needs lambda + 2 mu, shear needs mu."""
-    body = solid(gravity=0.0, nodal_pressure=False)
+    body = solid(gravity=0.0, element="linear")
     mu, lam = lame_constants(MATERIAL["youngs_modulus"], MATERIAL["poisson_ratio"])
     strain = 1e-5
     volume = body.volumes.sum()
@@ -139,11 +139,11 @@ def test_the_same_run_is_the_same_bit_for_bit() -> None:
     assert all(np.array_equal(runs[0], run) for run in runs[1:])
 
 
-@pytest.mark.parametrize("nodal_pressure", [True, False])
+@pytest.mark.parametrize("element", get_args(Element))
 @pytest.mark.parametrize("poisson_ratio", [0.0, 0.499])
-def test_highest_frequency(nodal_pressure: bool, poisson_ratio: float) -> None:
+def test_highest_frequency(element: Element, poisson_ratio: float) -> None:
     """Against the eigenvalues of the dense stiffness matrix, from differences of the force."""
-    body = solid(cells=1, poisson_ratio=poisson_ratio, nodal_pressure=nodal_pressure, gravity=0.0)
+    body = solid(cells=1, poisson_ratio=poisson_ratio, element=element, gravity=0.0)
     columns = []
     h = 1e-7
     for entry in range(3 * body.nodes):

@@ -50,7 +50,7 @@ def test_small_strain_stiffness(axis: int, poisson_ratio: float) -> None:
     material = {**MATERIAL, "youngs_modulus": 2e6, "poisson_ratio": poisson_ratio, "floor": False}
     start = CUBE[0]
     held = np.flatnonzero(start[:, axis] == start[:, axis].max())
-    exact = _sag(ExplicitSolid(*CUBE, **material, nodal_pressure=False, fixed=held), held)
+    exact = _sag(ExplicitSolid(*CUBE, **material, element="linear", fixed=held), held)
     body = VertexBlockDescent(*CUBE, **material, viscosity=3000.0, fixed=held, iterations=40)
     motion = body.run(start, np.zeros_like(start), frames=30, frame_time=0.01, substeps=5)
     sag = motion.positions[-1] - start
@@ -82,7 +82,7 @@ def test_viscosity_is_that_of_kelvin_and_voigt() -> None:
     material = {**MATERIAL, "youngs_modulus": 2e4, "viscosity": 3000.0, "floor": False}
     start = CUBE[0]
     held = np.flatnonzero(start[:, 2] == start[:, 2].max())
-    explicit = ExplicitSolid(*CUBE, **material, nodal_pressure=False, fixed=held)
+    explicit = ExplicitSolid(*CUBE, **material, element="linear", fixed=held)
     body = VertexBlockDescent(*CUBE, **material, fixed=held, iterations=40)
     rest = np.zeros_like(start)
     exact = explicit.run(start, rest, frames=10, frame_time=0.01, substeps=explicit.substeps(0.01, 0.5))

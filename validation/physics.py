@@ -202,7 +202,7 @@ def tissue_outlines(draw: Any, path: Array) -> Array:
 
 
 SHEET, BLOCK, TISSUE = "sheet_deformation", "deformable_block", "tissue_manipulation"
-PLAIN = replace(DROP_LEVELS["default"], nodal_pressure=False)
+PLAIN = replace(DROP_LEVELS["default"], element="linear")
 NEARLY_INCOMPRESSIBLE = tuple(i for i, ratio in enumerate(DROPPED_RATIOS) if ratio >= 0.49)
 STATIC = "the original is a static analysis without a time scale"
 

@@ -175,7 +175,7 @@ def test_every_term_matters(monkeypatch: pytest.MonkeyPatch, term: str, smallest
     parameters, level = teddy(2), DEFAULT
     usual = positions(parameters, DEFAULT.courant)
     if term == "nodal pressure":
-        level = replace(level, nodal_pressure=False)
+        level = replace(level, element="linear")
     else:
         monkeypatch.setattr(falling, term, 0.0)
     without = TEDDY.simulate_with(parameters, level, LATER + 1).positions.astype(np.float64)

@@ -82,7 +82,7 @@ def test_stiffness_converges_with_substeps(beam: Beam, iterations: int, allowed:
     """Of the first bending mode, nu 0.49. Too few sweeps over the nodes leave it too soft."""
     clamped = np.flatnonzero(beam[0][:, 0] == 0)
     options = {**BEAM_MATERIAL, "poisson_ratio": 0.49, "fixed": clamped}
-    explicit = ExplicitSolid(*beam, **options, nodal_pressure=False)
+    explicit = ExplicitSolid(*beam, **options, element="linear")
     exact, shape = _first_mode(explicit, clamped)
     reference, _ = _frequency_and_damping(explicit, shape, explicit.substeps(SAMPLING, 0.3))
     assert reference == pytest.approx(exact, rel=2e-3)
@@ -101,7 +101,7 @@ def test_it_damps_as_implicit_euler(beam: Beam, poisson_ratio: float) -> None:
     """A ratio of omega dt / 2 where the steps are solved: an error in time that no sweep takes away."""
     clamped = np.flatnonzero(beam[0][:, 0] == 0)
     options = {**BEAM_MATERIAL, "poisson_ratio": poisson_ratio, "fixed": clamped}
-    exact, shape = _first_mode(ExplicitSolid(*beam, **options, nodal_pressure=False), clamped)
+    exact, shape = _first_mode(ExplicitSolid(*beam, **options, element="linear"), clamped)
     body = VertexBlockDescent(*beam, **options, iterations=20)
     for substeps in (1, 2):
         frequency, damping = _frequency_and_damping(body, shape, substeps)
@@ -135,7 +135,7 @@ def test_drop_converges(
     def drop(body: ExplicitSolid | VertexBlockDescent, substeps: int) -> Motion:
         return body.run(start, velocity, frames=FRAMES, frame_time=FRAME_TIME, substeps=substeps)
 
-    explicit = ExplicitSolid(start, teddy.tetrahedra, **options, nodal_pressure=False)
+    explicit = ExplicitSolid(start, teddy.tetrahedra, **options, element="linear")
     reference = drop(explicit, explicit.substeps(FRAME_TIME, 0.5))
     errors = []
     for iterations, substeps in settings:

@@ -115,6 +115,6 @@ def reference_step(vertices: Floats, tetrahedra: Indices) -> float:
         density=1000.0,
         youngs_modulus=1e6,
         poisson_ratio=0.3,
-        nodal_pressure=True,
+        element="nodal pressure",
     )
     return 2 / body.highest_frequency

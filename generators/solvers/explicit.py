@@ -1,6 +1,6 @@
-"""Soft solids that fall on a rigid floor: explicit finite elements on linear tetrahedra, in Warp.
+"""Soft solids that fall on a rigid floor: explicit finite elements on tetrahedra, in Warp.
 
-To the stable neo-Hookean energy with nodal pressure (see `tetrahedra`) comes Kelvin-Voigt viscosity, with the
+To the stable neo-Hookean energy (see `tetrahedra`) comes Kelvin-Voigt viscosity, with the
 second Piola-Kirchhoff stress 2 eta dE/dt, which is objective. Without it nothing converges after an impact,
 which excites every frequency that the mesh has.
 
@@ -8,7 +8,7 @@ The floor is z = 0: a node that would pass it within the step gets the velocity 
 and Coulomb's law limits the tangential impulse by the same normal one. No penalty, so no parameter and no
 limit on the step.
 
-Time: leapfrog in double precision. Corner forces are written per tetrahedron and gathered per node, without
+Time: leapfrog in double precision. Forces are written per tetrahedron and gathered per node, without
 atomics, so the result does not depend on the order of execution. The same code runs on CPU and CUDA.
 """
 
@@ -24,9 +24,15 @@ from m3gn_bench.generators.solvers.explicit_kernels import (
     corner_forces,
     move,
     nodal_pressures,
+    quadratic_forces,
 )
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, SolidOptions
+from m3gn_bench.generators.solvers.tetrahedra import (
+    QUADRATIC_GRADIENTS,
+    Array,
+    Element,
+    SolidOptions,
+)
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
 
@@ -35,14 +41,11 @@ class ExplicitSolid(CapturedSolid):
     """A soft solid over a rigid floor, moved by leapfrog.
 
     Args:
-        vertices: stress-free positions [m], shape [nodes, 3].
-        tetrahedra: node indices, positively oriented, shape [cells, 4].
-        nodal_pressure: average the volume ratio over nodes; without it plain linear tetrahedra.
+        vertices, tetrahedra, element, options: see `TetrahedralSolid`.
         device: of Warp, "cpu" or "cuda:0".
-        options: see `TetrahedralSolid`.
 
     Raises:
-        ValueError: a parameter out of its physical range, or a tetrahedron without volume.
+        ParameterError: see `TetrahedralSolid`.
     """
 
     captured = 50
@@ -52,18 +55,22 @@ class ExplicitSolid(CapturedSolid):
         vertices: Array,
         tetrahedra: NDArray[np.int32],
         *,
-        nodal_pressure: bool = True,
+        element: Element = "nodal pressure",
         device: str = "cpu",
         **options: Unpack[SolidOptions],
     ) -> None:
-        super().__init__(vertices, tetrahedra, nodal_pressure=nodal_pressure, **options)
+        super().__init__(vertices, tetrahedra, element=element, **options)
         self.device = device
 
-        # Corners sorted by node: what a node gathers, always in the same order.
-        flat = self.tetrahedra.ravel()
+        # The cells' nodes, sorted: what a node gathers, always in the same order.
+        flat = self.element_nodes.ravel()
         incident = np.argsort(flat, kind="stable")
         start = np.searchsorted(flat[incident], np.arange(self.nodes + 1))
-        self._tetrahedra = self._upload(self.tetrahedra, wp.vec4i)
+        if element == "quadratic":
+            self._element_nodes = self._upload(self.element_nodes, wp.int32)
+            self._gradients = self._upload(QUADRATIC_GRADIENTS, wp.vec3d)
+        else:
+            self._tetrahedra = self._upload(self.tetrahedra, wp.vec4i)
         self._rest = self._upload(self.inverse_edges, wp.mat33d)
         self._volumes = self._upload(self.volumes, wp.float64)
         self._nodal_volumes = self._upload(self.nodal_volumes, wp.float64)
@@ -72,7 +79,7 @@ class ExplicitSolid(CapturedSolid):
         self._start = self._upload(start, wp.int32)
         self._cell_volumes = wp.zeros(self.cells, dtype=wp.float64, device=device)
         self._pressures = wp.zeros(self.nodes, dtype=wp.float64, device=device)
-        self._forces = wp.zeros(4 * self.cells, dtype=wp.vec3d, device=device)
+        self._forces = wp.zeros(self.element_nodes.size, dtype=wp.vec3d, device=device)
         self._x = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
         self._v = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
 
@@ -115,13 +122,19 @@ class ExplicitSolid(CapturedSolid):
         return forces * self.inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
 
     def _launch_forces(self) -> None:
+        law = [self.mu, self.lam, self.viscosity]
+        if self.element == "quadratic":
+            body = [self._element_nodes, self._gradients, self._rest, self._volumes]
+            self._launch(quadratic_forces, self.cells, self._x, self._v, *body, *law, self._forces)
+            return
         body = [self._tetrahedra, self._rest, self._volumes]
-        if self.nodal_pressure:
+        nodal_pressure = self.element == "nodal pressure"
+        if nodal_pressure:
             self._launch(cell_volumes, self.cells, self._x, *body, self._cell_volumes)
             gather = [self._start, self._incident, self._nodal_volumes]
             self._launch(nodal_pressures, self.nodes, self._cell_volumes, *gather, self.lam, self._pressures)
-        law = [self.mu, self.lam, self.viscosity, self.nodal_pressure]
-        self._launch(corner_forces, self.cells, self._x, self._v, *body, self._pressures, *law, self._forces)
+        body += [self._pressures, *law, nodal_pressure]
+        self._launch(corner_forces, self.cells, self._x, self._v, *body, self._forces)
 
     def _advance(self, substeps: int, substep: float) -> None:
         gather = [self._forces, self._start, self._incident, self._inverse_mass]

@@ -81,7 +81,7 @@ class VertexBlockDescent(CapturedSolid):
         device: str = "cpu",
         **options: Unpack[SolidOptions],
     ) -> None:
-        super().__init__(vertices, tetrahedra, nodal_pressure=False, **options)
+        super().__init__(vertices, tetrahedra, element="linear", **options)
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, not {iterations}")
         newton = _newton()
