@@ -192,7 +192,7 @@ def _falling_cells(scene: Any, usual: Any, kinds: dict[str, dict[str, Any]]) -> 
     from m3gn_bench.generators.falling import flight_frames
 
     default = scene.fidelities["default"]
-    reference = replace(default, refinements=1, courant=0.35)
+    reference = scene.fidelities["reference"]
     cells = []
     for name, kind in kinds.items():
         changes = dict(kind)

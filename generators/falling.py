@@ -105,7 +105,9 @@ class _FallingObjects(Leveled, SingleTask):
             refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40, element="linear"
         ),
         "default": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=160),
-        "reference": FallFidelity(refinements=1, courant=0.35, vbd_iterations=5, vbd_substeps=160),
+        "reference": FallFidelity(
+            refinements=0, courant=0.95, vbd_iterations=5, vbd_substeps=160, element="quadratic"
+        ),
     }
 
     def __post_init__(self) -> None:

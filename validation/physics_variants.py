@@ -454,8 +454,8 @@ def fall(
     with patch.object(falling, "FRICTION", friction), patch.object(falling, "VISCOSITY", viscosity):
         solid, substeps = scene._solid(start, body.tetrahedra, parameters, level)
     motion = solid.run(
-        start + down / 2 * flight**2,
-        np.tile(down * flight, (len(start), 1)),
+        solid.vertices + down / 2 * flight**2,
+        np.tile(down * flight, (solid.nodes, 1)),
         first_frame=IMPACT - 1,
         frames=RINGING.stop - IMPACT,
         frame_time=FRAME_TIME,
