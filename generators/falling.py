@@ -68,14 +68,14 @@ class FallFidelity:
     """Discretisation.
 
     Attributes:
-        refinements: how often each tetrahedron is split into eight.
+        parts: into how many parts each edge of the object's mesh is cut.
         courant: the explicit solver's step in units of its limit of stability at rest.
         vbd_iterations: sweeps of vertex block descent per substep.
         vbd_substeps: its substeps per frame.
         element: of the explicit solver, see `solvers.tetrahedra`; vertex block descent has linear tetrahedra.
     """
 
-    refinements: int
+    parts: int
     courant: float
     vbd_iterations: int
     vbd_substeps: int
@@ -101,12 +101,10 @@ class _FallingObjects(Leveled, SingleTask):
     scale_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.5)
     scale_length: ClassVar[float] = 0.5
     fidelities: ClassVar[dict[str, FallFidelity]] = {
-        "fast": FallFidelity(
-            refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=40, element="linear"
-        ),
-        "default": FallFidelity(refinements=0, courant=0.95, vbd_iterations=2, vbd_substeps=160),
+        "fast": FallFidelity(parts=1, courant=0.95, vbd_iterations=2, vbd_substeps=40, element="linear"),
+        "default": FallFidelity(parts=1, courant=0.95, vbd_iterations=2, vbd_substeps=160),
         "reference": FallFidelity(
-            refinements=0, courant=0.95, vbd_iterations=5, vbd_substeps=160, element="quadratic"
+            parts=1, courant=0.95, vbd_iterations=5, vbd_substeps=160, element="quadratic"
         ),
     }
 
@@ -152,8 +150,8 @@ class _FallingObjects(Leveled, SingleTask):
         frames = self.frames if frames is None else frames
         body = self.body(parameters.object)
         recorded, surface = body.surface_nodes, body.surface
-        for _ in range(level.refinements):
-            body = body.refined()
+        if level.parts > 1:
+            body = body.divided(level.parts)
         orientation = Rotation.from_quat(parameters.orientation)
         start = orientation.apply(SIZE * body.vertices)
         start[:, 2] += parameters.height - start[:, 2].min()

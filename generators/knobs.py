@@ -197,7 +197,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
         # At most a fifth of the default's step on every mesh: a cell cut in half has half the stable step, a quadratic
         # one less than a fourth.
         largest = 0.7 if level.element == "quadratic" else 0.175
-        return replace(level, courant=min(0.95, largest * 2**level.refinements))
+        return replace(level, courant=min(0.95, largest * level.parts))
 
     def sweeps(iterations: int, substeps: int) -> Setting:
         level = replace(default, vbd_iterations=iterations, vbd_substeps=substeps, element="linear")
@@ -216,15 +216,15 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
                 Setting("time step", f"{c:g} of the limit", replace(default, courant=c))
                 for c in (0.7, 0.35, 0.175)
             ),
-            Setting("mesh", "in eight", replace(default, refinements=1)),
-            Setting("element", "linear, in eight", replace(default, element="linear", refinements=1)),
+            Setting("mesh", "in eight", replace(default, parts=2)),
+            Setting("element", "linear, in eight", replace(default, element="linear", parts=2)),
             Setting("element", "quadratic, half the step", replace(quadratic, courant=0.475)),
             *(sweeps(*numbers) for numbers in ((10, 10), (2, 40), (2, 80))),
         ),
-        meshes=tuple(fine(replace(default, refinements=k)) for k in (0, 1, 2)),
-        cell_sizes=(1, 1 / 2, 1 / 4),
+        meshes=tuple(fine(replace(quadratic, parts=k)) for k in (1, 2, 3)),
+        cell_sizes=(1, 1 / 2, 1 / 3),
         with_fine_steps=fine,
-        full_length=lambda setting: setting.knob != "solver" and setting.level.refinements == 0,
+        full_length=lambda setting: setting.knob != "solver" and setting.level.parts == 1,
     )
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,6 @@ from m3gn_bench.generators.meshes.geometry import (
     reference_step,
     surface_nodes_first,
 )
-from m3gn_bench.generators.solvers.tetrahedra import EDGES
 
 MESHES = Path(__file__).parent / "meshes"
 HASHES = "hashes.json"  # beside the meshes
@@ -58,12 +58,6 @@ SAME_PLACE = 1e-7  # over the largest extent
 SMALLEST_VOLUME = 1e-9  # over the cube of the largest extent, below which a surface encloses nothing
 SMALLEST_STEP = 2e-5  # [s], of `reference_step`; it asks for 25 times the work of our own objects
 OWN_STEP, OWN_SUBSTEPS = 5e-4, 20  # the smallest of our own objects, and what it makes of a frame of 0.01 s
-
-# Red refinement: the edges' midpoints are the nodes 4..9 of a cell. Four cells keep a corner each; the
-# octahedron between them is cut along one of its diagonals, around which the other midpoints form a ring.
-CORNER_CELLS = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
-DIAGONALS = np.array([[4, 9], [5, 8], [6, 7]])
-RINGS = np.array([[5, 7, 8, 6], [4, 7, 9, 6], [4, 5, 9, 8]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,29 +94,51 @@ class SoftBody:
         """SHA-256 over names, shapes, types and bytes of the arrays; the name does not count."""
         return hash_arrays(self.arrays()).hexdigest()
 
-    def refined(self) -> "SoftBody":
-        """Every cell cut into eight of positive volume, the octahedron in its middle along the shortest
-        diagonal. Old nodes keep their indices and `surface_nodes` its value, so that the same nodes can be
-        recorded; the midpoints of edges follow."""
-        pairs = np.sort(self.tetrahedra[:, EDGES], axis=-1)
-        edges, places = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-        vertices = np.concatenate([self.vertices, self.vertices[edges].mean(1)])
-        nodes = np.concatenate([self.tetrahedra, len(self.vertices) + places.reshape(-1, len(EDGES))], axis=1)
-        ends = vertices[nodes[:, DIAGONALS]]
-        shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=-1).argmin(1)
-        ring = RINGS[shortest]
-        inner = np.stack(
-            [
-                np.concatenate([DIAGONALS[shortest], ring[:, [side, (side + 1) % 4]]], axis=1)
-                for side in range(4)
-            ],
-            axis=1,
+    def divided(self, parts: int) -> "SoftBody":
+        """Every edge cut into `parts`, and so every cell into parts^3 of equal volume (edgewise subdivision:
+        Edelsbrunner and Grayson, 2000). Old nodes keep their indices and `surface_nodes` its value, so that the same
+        nodes can be recorded; new ones follow."""
+        corners = np.sort(self.tetrahedra, axis=1)  # in this order neighbours cut a common face alike
+        points, cells = _division(parts)
+        # A new node is known by the corners that it lies between and its weight at each of them.
+        between = np.where(points > 0, corners[:, None], -1)
+        order = np.argsort(between, axis=2)
+        weights = np.broadcast_to(points, between.shape)
+        names = np.concatenate([np.take_along_axis(x, order, 2) for x in (between, weights)], axis=2).reshape(
+            -1, 8
         )
-        cells = np.concatenate([np.broadcast_to(CORNER_CELLS, inner.shape), inner], axis=1)
-        tetrahedra = np.take_along_axis(nodes[:, None], cells, axis=2).reshape(-1, 4).astype(np.int32)
+        is_old = names[:, 4:].max(1) == parts
+        places = np.where(is_old, names[:, :4].max(1), 0)
+        new, places_of_new = np.unique(names[~is_old], axis=0, return_inverse=True)
+        places[~is_old] = len(self.vertices) + places_of_new.ravel()
+        vertices = np.concatenate(
+            [self.vertices, np.einsum("nk,nkd->nd", new[:, 4:] / parts, self.vertices[new[:, :4]])]
+        )
+        tetrahedra = places.reshape(-1, len(points))[:, cells].reshape(-1, 4).astype(np.int32)
         inverted = cell_volumes(vertices, tetrahedra) < 0
         tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
         return replace(self, vertices=vertices, tetrahedra=tetrahedra)
+
+
+def _division(parts: int) -> tuple[np.ndarray, np.ndarray]:
+    """A tetrahedron cut into parts^3: weights of the points at its corners, shape [points, 4], and the cells.
+
+    With corners at 0, (n, 0, 0), (n, n, 0), (n, n, n) these are the cells of the unit cubes' Kuhn triangulation.
+    """
+    lattice = {
+        point: number
+        for number, point in enumerate(p for p in np.ndindex(*3 * [parts + 1]) if p[0] >= p[1] >= p[2])
+    }
+    cells = []
+    for start in lattice:
+        for axes in permutations(range(3)):
+            path = [start]
+            for axis in axes:
+                path.append(tuple(x + (k == axis) for k, x in enumerate(path[-1])))  # type: ignore[arg-type]
+            if all(point in lattice for point in path):
+                cells.append([lattice[point] for point in path])
+    i, j, k = np.array(list(lattice)).T
+    return np.stack([parts - i, i - j, j - k, k], axis=1), np.array(cells)
 
 
 def object_names() -> tuple[str, ...]:

@@ -91,7 +91,7 @@ def test_a_motion_that_diverges_is_computed_with_smaller_steps() -> None:
 
     class Hasty(FallingTeddy):
         fidelities: ClassVar[dict[str, FallFidelity]] = {
-            "default": FallFidelity(refinements=0, courant=2.8, vbd_iterations=1, vbd_substeps=1)
+            "default": FallFidelity(parts=1, courant=2.8, vbd_iterations=1, vbd_substeps=1)
         }
 
     hasty, usual = Hasty().simulate(parameters), TEDDY.simulate(parameters)

@@ -122,16 +122,18 @@ def test_a_pickled_body_is_the_same(tmp_path: Path) -> None:
     assert pickle.loads(pickle.dumps(body)).content_hash() == body.content_hash()
 
 
+@pytest.mark.parametrize("parts", [2, 3])
 @pytest.mark.parametrize("body", [load_object("teddy"), box(2)], ids=["teddy", "box"])
-def test_refined_body_is_the_same_body(body: SoftBody) -> None:
-    fine = body.refined()
+def test_divided_body_is_the_same_body(body: SoftBody, parts: int) -> None:
+    fine, cells = body.divided(parts), parts**3
     volumes = geometry.cell_volumes(body.vertices, body.tetrahedra)
     fine_volumes = geometry.cell_volumes(fine.vertices, fine.tetrahedra)
-    assert len(fine.tetrahedra) == 8 * len(body.tetrahedra)
-    np.testing.assert_allclose(fine_volumes.reshape(-1, 8), np.repeat(volumes[:, None] / 8, 8, 1), rtol=1e-9)
+    assert len(fine.tetrahedra) == cells * len(body.tetrahedra)
+    expected = np.repeat(volumes[:, None] / cells, cells, 1)
+    np.testing.assert_allclose(fine_volumes.reshape(-1, cells), expected, rtol=1e-9)
     np.testing.assert_array_equal(fine.vertices[: len(body.vertices)], body.vertices)
     assert fine.surface_nodes == body.surface_nodes
-    assert len(fine.surface) == 4 * len(body.surface)
+    assert len(fine.surface) == parts**2 * len(body.surface)
     assert geometry.is_closed(fine.surface)
     assert set(np.unique(body.surface)) <= set(np.unique(fine.surface))
     assert geometry.enclosed_volume(fine.vertices, fine.surface) == pytest.approx(volumes.sum(), rel=1e-12)
@@ -350,7 +352,7 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: 
 def test_a_closed_surface_is_filled(tmp_path: Path) -> None:
     for library in ("trimesh", "pyacvd", "pytetwild"):
         pytest.importorskip(library)
-    mesh = load_object("teddy").refined()  # has more surface nodes than are allowed
+    mesh = load_object("teddy").divided(2)  # has more surface nodes than are allowed
     inside_out = mesh.surface[:, ::-1]
     body = read_object(write_stl(tmp_path / "bear.stl", 12 * mesh.vertices + 5, inside_out))
     volumes = geometry.cell_volumes(body.vertices, body.tetrahedra)

@@ -446,8 +446,8 @@ def fall(
     scene = MixedObjects()
     body = scene.body(parameters.object)
     recorded = body.surface_nodes
-    for _ in range(level.refinements):
-        body = body.refined()
+    if level.parts > 1:
+        body = body.divided(level.parts)
     start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
     start[:, 2] += parameters.height - start[:, 2].min()
     down, flight = np.array([0.0, 0.0, -falling.GRAVITY]), (IMPACT - 1) * FRAME_TIME

@@ -33,10 +33,10 @@ def teddy(index: int = 0, **changes: float) -> FallParameters:
 
 
 def positions(
-    parameters: FallParameters, courant: float, refinements: int = 0, element: Element = "nodal pressure"
+    parameters: FallParameters, courant: float, parts: int = 1, element: Element = "nodal pressure"
 ) -> np.ndarray:
     """Recorded positions up to 0.2 s after the impact, at a discretisation of one's own."""
-    level = replace(DEFAULT, refinements=refinements, courant=courant, element=element)
+    level = replace(DEFAULT, parts=parts, courant=courant, element=element)
     return TEDDY.simulate_with(parameters, level, LATER + 1).positions.astype(np.float64)
 
 
@@ -66,7 +66,7 @@ def test_error_in_space_exceeds_that_in_time() -> None:
     eight comes closer."""
     parameters = teddy(youngs_modulus=2e5, poisson_ratio=0.3)
     default, quadratic = positions(parameters, COURANT), positions(parameters, COURANT, element="quadratic")
-    cut = positions(parameters, COURANT, refinements=1)
+    cut = positions(parameters, COURANT, parts=2)
     space, finer = (distance(x, quadratic, SOON) for x in (default, cut))
     time = distance(default, positions(parameters, COURANT / 4), SOON)
     print(f"in space {space:.1e}, in eight {finer:.1e}; in time {time:.1e}")
