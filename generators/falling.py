@@ -26,7 +26,7 @@ from m3gn_bench.generators.errors import (
 )
 from m3gn_bench.generators.objects import SoftBody, load_object
 from m3gn_bench.generators.scene import Leveled, SingleTask
-from m3gn_bench.generators.solvers.tetrahedra import Element, TetrahedralSolid
+from m3gn_bench.generators.solvers.tetrahedra import Element, Motion, TetrahedralSolid
 
 if TYPE_CHECKING:  # it loads Warp
     from m3gn_bench.generators.solvers.captured import CapturedSolid
@@ -36,6 +36,7 @@ DENSITY = 1000.0  # [kg/m^3]
 VISCOSITY = 100.0  # [Pa s]
 FRICTION = 0.5
 GRAVITY = 9.81  # [m/s^2]
+DOWN = np.array([0.0, 0.0, -GRAVITY])
 HEIGHT = 0.5  # [m], of the lowest point above the floor; from 1 m the softest bodies are squashed to a ball
 TRANSITIONS = 200
 FRAME_TIME = 0.01  # [s]
@@ -157,28 +158,12 @@ class _FallingObjects(Leveled, SingleTask):
         start[:, 2] += parameters.height - start[:, 2].min()
 
         # Until it touches the floor the body is free of stress, and its motion known.
-        down = np.array([0.0, 0.0, -GRAVITY])
         times = _flight_times(parameters.height)
         if frames <= len(times):
             raise ParameterError(f"frames must be more than the {len(times)} of the free fall, not {frames}")
-        flight = start[:recorded] + down / 2 * times[:, None, None] ** 2
+        flight = start[:recorded] + DOWN / 2 * times[:, None, None] ** 2
         solid, substeps = self._solid(start, body.tetrahedra, parameters, level)
-        for halving in range(MAX_HALVINGS + 1):
-            try:
-                motion = solid.run(
-                    solid.vertices + down / 2 * times[-1] ** 2,
-                    np.tile(down * times[-1], (solid.nodes, 1)),
-                    first_frame=len(times) - 1,
-                    frames=frames - len(times),
-                    frame_time=FRAME_TIME,
-                    substeps=substeps,
-                )
-                break
-            except SolverError:
-                # The step is stable at rest; a cell that is squashed flat may ask for a smaller one.
-                if halving == MAX_HALVINGS:
-                    raise
-                substeps *= 2
+        motion, substeps = land(solid, parameters.height, frames, substeps)
         positions = np.concatenate([flight, motion.positions[1:, :recorded]])
 
         energies, ratios = solid.monitor(motion)
@@ -359,6 +344,43 @@ def self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: i
             inside[mine, own[mine]] = False
         penetrating |= inside.any(0)
     return penetrating
+
+
+def land(solid: "CapturedSolid", height: float, frames: int, substeps: int) -> tuple[Motion, int]:
+    """Move a body from the last frame of its free fall on, with smaller steps where the motion diverges.
+
+    Args:
+        solid: at rest in the pose from which it falls.
+        height: of its lowest point then [m].
+        frames: until this one; frame 0 is the start of the fall.
+        substeps: per frame, to begin with.
+
+    Returns:
+        The motion from the last frame of the fall on, and the substeps that it took.
+
+    Raises:
+        SolverError: positions are not finite even with steps of an eighth.
+    """
+    time = _flight_times(height)[-1]
+    first = flight_frames(height) - 1
+    for halving in range(MAX_HALVINGS + 1):
+        try:
+            motion = solid.run(
+                solid.vertices + DOWN / 2 * time**2,
+                np.tile(DOWN * time, (solid.nodes, 1)),
+                first_frame=first,
+                frames=frames - 1 - first,
+                frame_time=FRAME_TIME,
+                substeps=substeps,
+            )
+        except SolverError:
+            # The step is stable at rest; a cell that is squashed flat may ask for a smaller one.
+            if halving == MAX_HALVINGS:
+                raise
+            substeps *= 2
+        else:
+            break
+    return motion, substeps
 
 
 def flight_frames(height: float) -> int:

@@ -22,7 +22,7 @@ from m3gn_bench.generators.deformable_block import (
     BlockParameters,
     DeformableBlock,
 )
-from m3gn_bench.generators.falling import FRAME_TIME, SIZE, FallFidelity, FallParameters, MixedObjects
+from m3gn_bench.generators.falling import SIZE, FallFidelity, FallParameters, MixedObjects
 from m3gn_bench.generators.sheet_deformation import (
     INCREMENTS,
     LOAD_RADIUS,
@@ -450,17 +450,9 @@ def fall(
         body = body.divided(level.parts)
     start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
     start[:, 2] += parameters.height - start[:, 2].min()
-    down, flight = np.array([0.0, 0.0, -falling.GRAVITY]), (IMPACT - 1) * FRAME_TIME
     with patch.object(falling, "FRICTION", friction), patch.object(falling, "VISCOSITY", viscosity):
         solid, substeps = scene._solid(start, body.tetrahedra, parameters, level)
-    motion = solid.run(
-        solid.vertices + down / 2 * flight**2,
-        np.tile(down * flight, (solid.nodes, 1)),
-        first_frame=IMPACT - 1,
-        frames=RINGING.stop - IMPACT,
-        frame_time=FRAME_TIME,
-        substeps=substeps,
-    )
+    motion, _ = falling.land(solid, parameters.height, RINGING.stop, substeps)
     energies, _ = solid.monitor(motion)
     total, first = energies.sum(1), IMPACT - 1
     ringing = range(RINGING.start - first, RINGING.stop - first)
