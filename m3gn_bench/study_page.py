@@ -153,7 +153,7 @@ def _tradeoff(study: TradeOff) -> str:
         " ".join(advice(study)),
         "",
         f"Test trajectories {', '.join(study.draws)}, frames {first} to {last}, relative to the {study.unit}; "
-        f"{study.machine}.",
+        f"{study.machine}; dataset version {study.dataset_version}.",
         "",
         f"Meshes with cells of {', '.join(f'{size:.2g}' for size in convergence.cell_sizes)}: distances "
         f"{', '.join(_percent(d) for d in convergence.distances)}, order {order}, remaining error of the "
@@ -198,7 +198,7 @@ def _tradeoff(study: TradeOff) -> str:
 
 def _stability(study: Stability) -> str:
     lines = [
-        f"### {TASKS[study.task].title}",
+        f"### {TASKS[study.task].title} (dataset version {study.dataset_version})",
         "",
         _row(["", "cell", "verdict", "error", "detail"]),
         _row(["---", "---", "---", "--:", "---"]),
