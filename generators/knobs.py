@@ -217,6 +217,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
                 for c in (0.7, 0.35, 0.175)
             ),
             Setting("mesh", "in eight", replace(default, parts=2)),
+            Setting("element", "linear", replace(default, element="linear")),
             Setting("element", "linear, in eight", replace(default, element="linear", parts=2)),
             *(sweeps(*numbers) for numbers in ((10, 10), (2, 40), (2, 80))),
         ),
