@@ -242,7 +242,7 @@ def _falling_teddy() -> Extremes:
                 "long run: 6 s": {"frames": 601},
             },
         ),
-        allowed=0.15,
+        allowed=0.1,
         size=SIZE,
     )
 
@@ -268,7 +268,7 @@ def _mixed_objects() -> Extremes:
                 "no such object": {"object": "dodo"},
             },
         ),
-        allowed=0.15,
+        allowed=0.1,
         size=SIZE,
     )
 
