@@ -134,7 +134,7 @@ def _division(parts: int) -> tuple[np.ndarray, np.ndarray]:
         for axes in permutations(range(3)):
             path = [start]
             for axis in axes:
-                path.append(tuple(x + (k == axis) for k, x in enumerate(path[-1])))  # type: ignore[arg-type]
+                path.append(tuple(x + (k == axis) for k, x in enumerate(path[-1])))
             if all(point in lattice for point in path):
                 cells.append([lattice[point] for point in path])
     i, j, k = np.array(list(lattice)).T
@@ -178,7 +178,7 @@ def write_object(body: SoftBody, path: Path) -> None:
     """
     if _is_npz(path):
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, **body.arrays())  # type: ignore[arg-type]
+        np.savez_compressed(buffer, **body.arrays())
         write_bytes_atomically(path, buffer.getvalue())
         return
     meshio = _optional("meshio", path)
