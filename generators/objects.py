@@ -178,7 +178,7 @@ def write_object(body: SoftBody, path: Path) -> None:
     """
     if _is_npz(path):
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, **body.arrays())
+        np.savez_compressed(buffer, **body.arrays())  # type: ignore[arg-type]
         write_bytes_atomically(path, buffer.getvalue())
         return
     meshio = _optional("meshio", path)
