@@ -231,8 +231,8 @@ def draw(study: TradeOff) -> "Figure":
         if points:
             axes.plot(*zip(*points, strict=True), "o", zorder=3, label=knob, color=next(colours))
         for s in shown:
-            place = {"xy": (s.seconds or 0, s.error or 0), "xytext": (5, 4)}
-            axes.annotate(s.label, **place, textcoords="offset points", fontsize=7)
+            at = (s.seconds or 0, s.error or 0)
+            axes.annotate(s.label, at, xytext=(5, 4), textcoords="offset points", fontsize=7)
     for name in dict.fromkeys(m.model for m in study.models):
         ones = [m for m in study.models if m.model == name]
         axes.plot(
