@@ -152,8 +152,7 @@ class _FallingObjects(Leveled, SingleTask):
         frames = self.frames if frames is None else frames
         body = self.body(parameters.object)
         recorded, surface = body.surface_nodes, body.surface
-        if level.parts > 1:
-            body = body.divided(level.parts)
+        body = body.divided(level.parts)
         orientation = Rotation.from_quat(parameters.orientation)
         start = orientation.apply(SIZE * body.vertices)
         start[:, 2] += parameters.height - start[:, 2].min()
@@ -362,8 +361,8 @@ def land(solid: "CapturedSolid", height: float, frames: int, substeps: int) -> t
     Raises:
         SolverError: positions are not finite even with steps of an eighth.
     """
-    time = _flight_times(height)[-1]
     first = flight_frames(height) - 1
+    time = FRAME_TIME * first
     for halving in range(MAX_HALVINGS + 1):
         try:
             motion = solid.run(

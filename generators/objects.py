@@ -97,7 +97,9 @@ class SoftBody:
     def divided(self, parts: int) -> "SoftBody":
         """Every edge cut into `parts`, and so every cell into parts^3 of equal volume (edgewise subdivision:
         Edelsbrunner and Grayson, 2000). Old nodes keep their indices and `surface_nodes` its value, so that the same
-        nodes can be recorded; new ones follow."""
+        nodes can be recorded; new ones follow. One part: the body itself."""
+        if parts == 1:
+            return self
         corners = np.sort(self.tetrahedra, axis=1)  # in this order neighbours cut a common face alike
         points, cells = _division(parts)
         # A new node is known by the corners that it lies between and its weight at each of them.

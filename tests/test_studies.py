@@ -308,7 +308,7 @@ RECORDS = Path(__file__).parents[1] / "docs" / "studies"
 
 
 def test_recorded_tradeoffs() -> None:
-    """Every task has one, with the default fidelity on the front, at least where steps and mesh count each for itself.
+    """Every task has one, with the default fidelity on the front where steps and mesh count each for itself.
 
     References are converged but for falling bodies, where the third mesh still differs from the second by two thirds
     as much as that from the first: thin limbs of linear tetrahedra hit the floor. The page says so.
@@ -318,7 +318,7 @@ def test_recorded_tradeoffs() -> None:
     for study in found:
         assert not study.default.refused
         assert study.default.error
-        assert study.default.on_front or study.default.on_front_by_parts, study.task
+        assert study.default.on_front_by_parts, study.task
         assert is_converged(study) != study.scene.startswith(("falling", "mixed")), study.task
 
 

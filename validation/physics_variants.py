@@ -446,8 +446,7 @@ def fall(
     scene = MixedObjects()
     body = scene.body(parameters.object)
     recorded = body.surface_nodes
-    if level.parts > 1:
-        body = body.divided(level.parts)
+    body = body.divided(level.parts)
     start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
     start[:, 2] += parameters.height - start[:, 2].min()
     with patch.object(falling, "FRICTION", friction), patch.object(falling, "VISCOSITY", viscosity):

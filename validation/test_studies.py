@@ -25,7 +25,8 @@ def shipped(task: str, *models: str) -> list[Shipped]:
 def test_tradeoff(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One draw, and of every knob what is cheap: the same errors as on record, of the same order.
 
-    Other checks run beside this one, so times that differ by less than half count as equal.
+    Other checks run beside this one, so times that differ by less than half count as equal. That alone takes Deformable
+    Block off the front by parts: a tolerance of 1e-3 is better solved, and a sixth slower. By total error it stays.
     """
     monkeypatch.setattr(tradeoff, "TIME_MARGIN", 1.5)
     task, knobs = get_task(name), knobs_of(name)

@@ -84,11 +84,12 @@ def corner_forces(
     corners = tetrahedra[cell]
     inverse_edges = rest[cell]
     F = _deformation_gradient(x, corners, inverse_edges)
-    pressure = lam * (wp.determinant(F) - wp.float64(1.0))
     if nodal_pressure:
         pressure = wp.float64(0.25) * (
             pressures[corners[0]] + pressures[corners[1]] + pressures[corners[2]] + pressures[corners[3]]
         )
+    else:
+        pressure = lam * (wp.determinant(F) - wp.float64(1.0))
     rate = wp.mat33d()
     if viscosity > wp.float64(0.0):
         rate = _deformation_gradient(v, corners, inverse_edges)
