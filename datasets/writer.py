@@ -5,6 +5,7 @@ flushed to disk and renamed. A killed run leaves whole shards (the next run goes
 a file under a name that anybody reads.
 """
 
+import fcntl
 import io
 import os
 import re
@@ -47,6 +48,30 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
     """Write a whole file or nothing."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+@contextmanager
+def reserved(folder: Path, taken: str) -> Iterator[None]:
+    """The folder, made if need be, for this process alone (the lock ends with the process).
+
+    Args:
+        folder: what to reserve.
+        taken: what another process does that holds it, for the message.
+
+    Raises:
+        DatasetError: another process has it, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / "lock").open("w")
+    except OSError as error:
+        raise DatasetError(f"cannot write to {folder.parent}: {error.strerror or error}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DatasetError(f"{taken} in {folder.parent}; wait until it has finished") from None
+        yield
 
 
 def write_shard(path: Path, key: str, trajectory: Trajectory, metadata: Metadata) -> str:

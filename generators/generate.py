@@ -1,13 +1,12 @@
 """Make a dataset: draw, simulate, check, shard, merge. Resumable, and the same for any number of workers."""
 
-import fcntl
 import os
 import platform
 import shutil
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from m3gn_bench.datasets.schema import (
     trajectory_key,
 )
 from m3gn_bench.datasets.trajectory import Trajectory
-from m3gn_bench.datasets.writer import merge_shards, write_shard
+from m3gn_bench.datasets.writer import merge_shards, reserved, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.scene import Scene
 from m3gn_bench.generators.workers import run_jobs
@@ -146,7 +145,7 @@ def generate(
         for i in range(sizes[split])
     }
     shards = {key: shard_folder / f"{key}.h5" for key in wanted}
-    with _reserved(shard_folder):
+    with reserved(shard_folder, "another process generates this dataset"):
         for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
             left_by_killed_run.unlink()
         todo: list[str] = []
@@ -203,24 +202,6 @@ def machine() -> str:
     lines = names.read_text().splitlines() if names.is_file() else []
     model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
     return f"{model or platform.processor() or platform.machine()}, {os.cpu_count()} cores"
-
-
-@contextmanager
-def _reserved(folder: Path) -> Iterator[None]:
-    """The folder of shards, made if need be, for this process alone (the lock ends with the process)."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("w")
-    except OSError as error:
-        raise DatasetError(f"cannot write to {folder.parent}: {error.strerror or error}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise GeneratorError(
-                f"another process generates this dataset in {folder.parent}; wait until it has finished"
-            ) from None
-        yield
 
 
 def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:

@@ -86,7 +86,7 @@ def _sheet_deformation() -> Knobs:
         size=None,
         settings=(
             *_fidelities(SheetDeformation),
-            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-4)),
+            *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-6)),
             Setting("mesh", "even, 14 x 14", replace(default, border_layer=False)),
             Setting("mesh", "even, 28 x 28", replace(default, border_layer=False, refinement=2)),
             Setting("mesh", "32 x 32", replace(default, refinement=2)),
@@ -188,16 +188,17 @@ def _tissue_manipulation() -> Knobs:
 
 
 def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
-    from m3gn_bench.generators.falling import SIZE
+    from m3gn_bench.generators.falling import HEIGHT, SIZE, flight_frames
 
     default = scene.fidelities["default"]
     quadratic = scene.fidelities["reference"]
+    contact = flight_frames(HEIGHT)
 
     def fine(level: Any) -> Any:
         # At most a fifth of the default's step on every mesh: a cell cut in half has half the stable step, a quadratic
         # one less than a fourth.
         largest = 0.7 if level.element == "quadratic" else 0.175
-        return replace(level, courant=min(0.95, largest * level.parts))
+        return replace(level, courant=min(0.85, largest * level.parts))
 
     def sweeps(iterations: int, substeps: int) -> Setting:
         level = replace(default, vbd_iterations=iterations, vbd_substeps=substeps, element="linear")
@@ -206,15 +207,15 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
 
     return Knobs(
         draws=draws,
-        first=33,  # the impact's first 0.05 s: what follows is more and more sensitive to everything
-        last=37,
-        frames=38,
+        first=contact,
+        last=contact + 5,  # the impact's first 0.06 s: what follows is more and more sensitive to everything
+        frames=contact + 6,
         size=SIZE,
         settings=(
             *_fidelities(scene),
             *(
                 Setting("time step", f"{c:g} of the limit", replace(default, courant=c))
-                for c in (0.7, 0.35, 0.175)
+                for c in (0.6, 0.3, 0.15)
             ),
             Setting("mesh", "in eight", replace(default, parts=2)),
             Setting("element", "linear", replace(default, element="linear")),

@@ -65,7 +65,7 @@ class SheetDeformation(Leveled, SimulatedWithScikitFem):
     """The scene. Positions in mm, moduli in MPa, forces in N; a frame is 1/50 of the load."""
 
     name: ClassVar[str] = "sheet_deformation"
-    dataset_version: ClassVar[str] = "1.0"
+    dataset_version: ClassVar[str] = "2.0"
     tasks: ClassVar[tuple[str, ...]] = ("sheet_deformation", "sheet_deformation_ood")
     paper_sizes: ClassVar[dict[Split, int]] = {"train": 630, "validation": 135, "test": 135}
     frames: ClassVar[int] = INCREMENTS + 1
@@ -79,7 +79,7 @@ class SheetDeformation(Leveled, SimulatedWithScikitFem):
     variant: ClassVar[dict[str, str]] = {}
     fidelities: ClassVar[dict[str, SheetFidelity]] = {
         "fast": SheetFidelity(refinement=1, tolerance=1e-3, border_layer=False),
-        "default": SheetFidelity(refinement=1, tolerance=1e-6),
+        "default": SheetFidelity(refinement=1, tolerance=1e-4),
         "reference": SheetFidelity(refinement=2, tolerance=1e-8),
     }
 

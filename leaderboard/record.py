@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from m3gn_bench.checkpoint import Checkpoint
+from m3gn_bench.data import Materials
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.metrics import TrajectoryErrors, confidence_interval
 
 HOME = Path(__file__).parent
-RECORD_SCHEMA = 1
+RECORD_SCHEMA = 2
 HASH_DIGITS = 16  # of a trajectory's content hash, enough to tell trajectories apart
 
 
@@ -79,18 +80,30 @@ class ContextResult(Record):
 
 
 class ResultRecord(Record):
-    """One row of the leaderboard and everything needed to re-derive it."""
+    """One row of the leaderboard and everything needed to re-derive it.
+
+    Attributes:
+        track: which board it belongs to.
+        variant: what differs from the model's preset, in a word; empty where nothing does.
+        materials: that trajectories were restricted to, in all splits; empty for all.
+        dataset_version, dataset_hash: of the trajectories evaluated on.
+        commit: of the code, if it ran from a checkout.
+        ships: whether the checkpoint is kept beside the records, so that anybody can re-derive the errors.
+    """
 
     record_schema: int = RECORD_SCHEMA
     track: str
     task: str
     model: str
     preset: str
+    variant: str = ""
+    materials: Materials = Field(default={})
     seed: int
     parameters: int
     tier: str
     split: str
-    dataset_hash: str  # of the trajectories evaluated on
+    dataset_version: str
+    dataset_hash: str
     keys: tuple[str, ...]
     trajectory_hashes: tuple[str, ...]
     package_version: str
@@ -98,6 +111,7 @@ class ResultRecord(Record):
     evaluation_device: str
     evaluation_seconds: float
     checkpoint: Checkpoint
+    ships: bool
     results: tuple[ContextResult, ...]
 
     @model_validator(mode="after")
@@ -112,7 +126,7 @@ class ResultRecord(Record):
     @property
     def name(self) -> str:
         """Identifies the record within a task."""
-        return f"{self.model}-{self.preset}-s{self.seed}"
+        return run_name(self.model, self.preset, self.variant, self.seed)
 
     def result(self, context: int) -> ContextResult | None:
         """The result at a context size, if recorded."""
@@ -127,6 +141,11 @@ class ResultRecord(Record):
         return float(np.mean([errors[key] for key in keys]))
 
 
+def run_name(model: str, preset: str, variant: str, seed: int) -> str:
+    """Name of a run within its track and task, as used for files."""
+    return "-".join([model, preset, *([variant.replace(" ", "_")] if variant else []), f"s{seed}"])
+
+
 def record_path(record: ResultRecord, home: Path = HOME) -> Path:
     """Where a record belongs."""
     return home / "records" / record.track / record.task / f"{record.name}.json"
@@ -134,7 +153,7 @@ def record_path(record: ResultRecord, home: Path = HOME) -> Path:
 
 def checkpoint_folder(task: str, model: str, preset: str, seed: int = 0, home: Path = HOME) -> Path:
     """Where the reference checkpoint that ships with the project lies."""
-    return home / "checkpoints" / task / f"{model}-{preset}-s{seed}"
+    return home / "checkpoints" / task / run_name(model, preset, "", seed)
 
 
 def write_record(record: ResultRecord, home: Path = HOME) -> Path:
@@ -156,22 +175,21 @@ def _rounded(value: object) -> object:
     return value
 
 
+def read_record(path: Path) -> ResultRecord:
+    """One record. Raises BenchError if the file is none, or its numbers contradict each other."""
+    try:
+        return ResultRecord.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise BenchError(f"{path} is no valid result record: {place}: {first['msg']}") from error
+
+
 def read_records(home: Path = HOME) -> list[ResultRecord]:
     """All records, sorted by track, task and name. Raises BenchError naming a file that is none."""
-    records = []
-    for path in sorted((home / "records").rglob("*.json")):
-        try:
-            records.append(ResultRecord.model_validate_json(path.read_bytes()))
-        except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            raise BenchError(f"{path} is no valid result record: {place}: {first['msg']}") from error
-    return records
+    return [read_record(path) for path in sorted((home / "records").rglob("*.json"))]
 
 
-def find_record(
-    records: Sequence[ResultRecord], task: str, model: str, preset: str, seed: int
-) -> ResultRecord | None:
-    """The record of a run, if there is one."""
-    wanted = (task, model, preset, seed)
-    return next((r for r in records if (r.task, r.model, r.preset, r.seed) == wanted), None)
+def find_record(records: Sequence[ResultRecord], track: str, task: str, name: str) -> ResultRecord | None:
+    """The record of a run (see `run_name`), if there is one."""
+    return next((r for r in records if (r.track, r.task, r.name) == (track, task, name)), None)

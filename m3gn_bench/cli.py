@@ -9,7 +9,7 @@ import click
 from m3gn_bench.console import JSON, Report, table
 from m3gn_bench.dataset_commands import card, generate, info, reproduce, validate, view
 from m3gn_bench.datasets.errors import BenchError
-from m3gn_bench.leaderboard_commands import leaderboard
+from m3gn_bench.leaderboard_commands import campaign, leaderboard
 from m3gn_bench.model_commands import evaluate, profile, train
 from m3gn_bench.study_commands import render_studies, stability, tradeoff
 from m3gn_bench.version import __version__
@@ -153,6 +153,6 @@ for command in (
     *(generate, validate, info, view, card, reproduce),
     *(train, evaluate, profile),
     *(tradeoff, stability, render_studies),
-    leaderboard,
+    *(campaign, leaderboard),
 ):
     cli.add_command(command)

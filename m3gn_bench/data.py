@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.datasets.trajectory import FIXED, Trajectory
@@ -246,9 +246,38 @@ def case_from(task: Task, scaling: Scaling, trajectory: Trajectory, key: str) ->
     return Case(body, scaled(trajectory.positions), collider_path, (key,))
 
 
-def load_cases(path: Path, task: Task, split: Split, tier: str | None = None) -> list[Case]:
-    """All trajectories of a split, in memory (every hash is verified on the way)."""
+Materials = dict[str, tuple[float, ...]]  # values of material parameters, in their units
+
+
+def load_cases(
+    path: Path,
+    task: Task,
+    split: Split,
+    tier: str | None = None,
+    materials: Materials | None = None,
+) -> list[Case]:
+    """All trajectories of a split, in memory (every hash is verified on the way).
+
+    Args:
+        path: the dataset file.
+        task, split, tier: what to read of it.
+        materials: read only trajectories of these.
+
+    Raises:
+        DatasetError: the file is damaged, or holds no such trajectories.
+        ConfigError: the scene has no such material parameter.
+    """
     dataset = TrajectoryDataset(path, task.name, split, tier)
-    if not dataset.keys:
-        raise DatasetError(f"{path} holds no {split} trajectories of task {task.name}")
-    return [case_from(task, dataset.metadata, dataset[i], key) for i, key in enumerate(dataset.keys)]
+    unknown = set(materials or {}) - set(dataset.metadata.material_units)
+    if unknown:
+        raise ConfigError(
+            unknown_name("material parameter", min(unknown), list(dataset.metadata.material_units))
+        )
+    cases = []
+    for key, trajectory in zip(dataset.keys, map(dataset.__getitem__, range(len(dataset))), strict=True):
+        if all(trajectory.material[name] in values for name, values in (materials or {}).items()):
+            cases.append(case_from(task, dataset.metadata, trajectory, key))
+    if not cases:
+        of = f" of materials {materials}" if materials else ""
+        raise DatasetError(f"{path} holds no {split} trajectories of task {task.name}{of}")
+    return cases

@@ -12,6 +12,7 @@ Mesh and collider are connected, both ways, where nodes are closer than `CONTACT
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -40,6 +41,11 @@ class Graph:
     senders: Tensor
     receivers: Tensor
     inverse_degree: Tensor
+
+    @cached_property
+    def endpoint_rows(self) -> Tensor:
+        """Rows of a table [2 nodes, n] with a node's part as sender and as receiver in turn, shape [edges, 2]."""
+        return torch.stack([2 * self.senders, 2 * self.receivers + 1], dim=1)
 
 
 def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, features: Tensor) -> Graph:

@@ -11,12 +11,33 @@ with embedded edges and nodes are composed with the embeddings, which saves most
 """
 
 from collections.abc import Iterable
-from typing import cast
+from typing import Any, cast
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from m3gn_bench.graph import Graph
+
+
+class _SumOfEndpoints(torch.autograd.Function):
+    """table[2 sender] + table[2 receiver + 1] for every edge, in one pass over memory.
+
+    The backward pass of `embedding_bag` itself sorts the edges anew each time.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, graph: Graph) -> Tensor:
+        ctx.rows, ctx.graph = len(table), graph
+        return functional.embedding_bag(graph.endpoint_rows, table, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = gradients
+        total = gradient.new_zeros(ctx.rows, gradient.shape[1])
+        for rows in ctx.graph.endpoint_rows.T.contiguous():
+            total.index_add_(0, rows, gradient)
+        return total, None
 
 
 class MessagePassingBlock(nn.Module):
@@ -33,18 +54,31 @@ class MessagePassingBlock(nn.Module):
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
         """Update nodes [nodes, width] and edges [edges, width]."""
-        message = functional.linear(edges, self.edge_linear.weight)
-        return self.update(nodes, edges, message, self.endpoint_linear(nodes), graph)
+        product = (edges, self.edge_linear.weight, self.edge_linear.bias)
+        return self.update(nodes, edges, self.endpoint_linear(nodes), product, graph)
 
     def update(
-        self, nodes: Tensor, edges: Tensor, message: Tensor, endpoints: Tensor, graph: Graph
+        self,
+        nodes: Tensor,
+        edges: Tensor,
+        endpoints: Tensor,
+        product: tuple[Tensor, Tensor, Tensor],
+        graph: Graph,
     ) -> tuple[Tensor, Tensor]:
-        """Update nodes and edges, given the products of W_e with edges (overwritten) and with nodes."""
-        sender, receiver = endpoints.chunk(2, dim=-1)
-        # In place where autograd allows it, and b_e added to nodes, of which there are fewer than edges: on a
-        # CPU this is bound by memory, not by arithmetic.
-        message += (sender + self.edge_linear.bias.to(sender.dtype)).index_select(0, graph.senders)
-        message += receiver.index_select(0, graph.receivers)
+        """Update nodes and edges.
+
+        Args:
+            nodes, edges: shape [nodes, width] and [edges, width].
+            endpoints: the products of W_s and W_r with nodes, shape [nodes, 2 width].
+            product: x, A and c with A x + c = W_e e + b_e on every edge.
+            graph: the graph.
+        """
+        inputs, weight, bias = product
+        # In place where autograd allows it, and c added to nodes, of which there are fewer than edges: on a CPU this
+        # is bound by memory, not by arithmetic.
+        endpoints = endpoints + functional.pad(bias, (0, len(bias)))
+        message = cast(Tensor, _SumOfEndpoints.apply(endpoints.view(-1, len(bias)), graph))
+        message.addmm_(inputs.to(message.dtype), weight.to(message.dtype).T)
         edges = self.edge_norm(edges + functional.leaky_relu_(message))
         # Under autocast on CUDA, edges are float32 after the norm, and nodes need not be.
         summed = edges.new_zeros(nodes.shape).index_add_(0, graph.receivers, edges)
@@ -79,19 +113,19 @@ class MessagePassingNetwork(nn.Module):
         nodes = self.embed_nodes(graph.node_features)
         edges = self.embed_edges(graph.edge_features)
         first, *others = cast(Iterable[MessagePassingBlock], self.blocks)
-        nodes, edges = first.update(
-            nodes,
-            edges,
-            _compose(first.edge_linear.weight, self.embed_edges, graph.edge_features),
-            _compose(first.endpoint_linear.weight, self.embed_nodes, graph.node_features),
-            graph,
+        # Inputs are many and short, so a product of weights saves one with each of them.
+        weight, bias = _composed(first.edge_linear.weight, self.embed_edges)
+        endpoints = functional.linear(
+            graph.node_features, *_composed(first.endpoint_linear.weight, self.embed_nodes)
         )
+        product = (graph.edge_features, weight, bias + first.edge_linear.bias)
+        nodes, edges = first.update(nodes, edges, endpoints, product, graph)
         for block in others:
             nodes, edges = block(nodes, edges, graph)
         outputs = self.readout(functional.leaky_relu(self.hidden(nodes)))
         return outputs.to(graph.node_features.dtype)  # also under autocast
 
 
-def _compose(weight: Tensor, inner: nn.Linear, inputs: Tensor) -> Tensor:
-    """weight @ inner(inputs) as one layer: inputs are many and short, so a product with `weight` is saved."""
-    return functional.linear(inputs, weight @ inner.weight, weight @ inner.bias)
+def _composed(weight: Tensor, inner: nn.Linear) -> tuple[Tensor, Tensor]:
+    """Weight and bias of the layer that multiplies the output of `inner`."""
+    return weight @ inner.weight, weight @ inner.bias

@@ -1,8 +1,6 @@
 """The commands that train, score and time models; part of the command line (see `cli`)."""
 
 import os
-import subprocess
-import time
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -12,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from m3gn_bench.console import DATA, JSON, WORKERS, Report, table
-from m3gn_bench.version import __version__
 
 if TYPE_CHECKING:
     from m3gn_bench.profiling import Profile, Ratios
@@ -185,22 +182,12 @@ def evaluate(
 
     Test trajectories are simulated first if they are not there yet.
     """
-    from m3gn_bench.checkpoint import load_checkpoint, read_description
+    from m3gn_bench.checkpoint import read_description
     from m3gn_bench.cpu import use_cpu
-    from m3gn_bench.data import load_cases
-    from m3gn_bench.datasets.file import content_hash, open_file, stored_hashes
     from m3gn_bench.datasets.schema import as_split
     from m3gn_bench.errors import CheckpointError, ConfigError
-    from m3gn_bench.evaluation import evaluate_model
-    from m3gn_bench.leaderboard.record import (
-        HASH_DIGITS,
-        ContextResult,
-        ResultRecord,
-        checkpoint_folder,
-        find_record,
-        read_records,
-        write_record,
-    )
+    from m3gn_bench.leaderboard.record import checkpoint_folder, find_record, read_records, write_record
+    from m3gn_bench.leaderboard.scoring import score
     from m3gn_bench.model import get_model_class, model_names
     from m3gn_bench.sources import find_or_generate
     from m3gn_bench.tasks import TASKS, get_task
@@ -236,7 +223,6 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     for name, folder in folders.items():
         task = get_task(name)
-        loaded, described = load_checkpoint(folder)
         with report.progress(f"simulating {task.scene}") as on_progress:
             path = find_or_generate(
                 task,
@@ -246,38 +232,20 @@ def evaluate(
                 workers=workers,
                 on_progress=on_progress,
             )
-        cases = load_cases(path, task, part, tier)
-        start = time.perf_counter()
         with report.progress(f"evaluating {name}") as on_progress:
-            errors = evaluate_model(loaded, cases, sizes or task.context_sizes, on_progress)
-        seconds = time.perf_counter() - start
-        results = [ContextResult.from_errors(context, e) for context, e in errors.items()]
-        keys = tuple(case.keys[0] for case in cases)
-        with open_file(path) as file:
-            dataset_hash = content_hash(file, tier, (part,))
-            hashes = stored_hashes(file)
-        record = ResultRecord(
-            track=track,
-            task=name,
-            model=model,
-            preset=described.config.preset,
-            seed=described.seed,
-            parameters=loaded.parameter_count(),
-            tier=tier,
-            split=split,
-            dataset_hash=dataset_hash,
-            keys=keys,
-            trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),
-            package_version=__version__,
-            commit=_commit(),
-            evaluation_device="cpu",
-            evaluation_seconds=seconds,
-            checkpoint=described,
-            results=tuple(results),
-        )
+            record = score(
+                folder,
+                path,
+                track=track,
+                tier=tier,
+                split=part,
+                contexts=sizes,
+                ships=record_home is not None and _is_shipped(folder, record_home),
+                on_progress=on_progress,
+            )
         if record_home is not None:
             write_record(record, record_home)
-        reference = find_record(recorded, name, model, record.preset, record.seed)
+        reference = find_record(recorded, track, name, record.name)
         rows += [
             {
                 "task": name,
@@ -289,12 +257,12 @@ def evaluate(
                 "mse_free_nodes": r.mse_free_nodes,
                 "ci95": r.ci95,
                 "per_timestep_mse": r.per_timestep_mse,
-                "trajectories": len(keys),
-                "recorded_mse": reference.mse_over(r.context, keys)
+                "trajectories": len(record.keys),
+                "recorded_mse": reference.mse_over(r.context, record.keys)
                 if reference and split == "test"
                 else None,
             }
-            for r in results
+            for r in record.results
         ]
     report.finish(
         {"model": model, "tier": tier, "split": split, "results": rows},
@@ -331,6 +299,16 @@ def evaluate(
             ],
         ),
     )
+
+
+def _is_shipped(checkpoint: Path, home: Path) -> bool:
+    """Whether a checkpoint lies where those that ship with a leaderboard do."""
+    from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.leaderboard.record import checkpoint_folder
+
+    found = read_description(checkpoint)
+    place = checkpoint_folder(found.task, found.config.model_name, found.config.preset, found.seed, home)
+    return checkpoint.resolve() == place.resolve()
 
 
 def _parse_contexts(text: str) -> list[int]:
@@ -465,21 +443,3 @@ def profile(
             ],
         ),
     )
-
-
-def _commit() -> str | None:
-    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
-    checkout = Path(__file__).parents[1]
-    if not (checkout / "pyproject.toml").is_file():
-        return None
-    git = ["git", "-C", str(checkout)]
-    try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        # Records and checkpoints are what is being made: they change no number.
-        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/LEADERBOARD.md"]
-        status = subprocess.run(
-            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")

@@ -76,7 +76,8 @@ def tradeoff(
 
     Takes some minutes; an interrupted run goes on where it stopped.
     """
-    from m3gn_bench.study_page import advice, draw, require_drawable, save
+    from m3gn_bench.figures import require_drawable, save
+    from m3gn_bench.study_page import advice, draw
     from m3gn_bench.tasks import get_task
     from m3gn_bench.tradeoff import measure
 
@@ -201,7 +202,8 @@ def stability(
 def render_studies(docs: Path, check: bool, as_json: bool) -> None:
     """Make DOCS/tradeoff.md and its figures from the records in DOCS/studies.  [default: docs]"""
     from m3gn_bench.errors import ConfigError
-    from m3gn_bench.study_page import draw, read_records, render, save
+    from m3gn_bench.figures import save
+    from m3gn_bench.study_page import draw, read_records, render
 
     tradeoffs, stabilities = read_records(docs / "studies")
     if not tradeoffs:

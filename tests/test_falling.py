@@ -67,7 +67,7 @@ def test_a_trajectory(fall: Trajectory) -> None:
     assert fall.tags == {"object": "teddy"}
     assert fall.material == {"youngs_modulus": 2e5, "poisson_ratio": 0.3}
     assert TEDDY.check(fall) == []
-    assert 0 < fall.diagnostics["energy_left"] < 0.5
+    assert 0 < fall.diagnostics["energy_left"] < 0.9  # of the potential energy most is that of its own height
     squashed = np.ptp(fall.positions[:, :, 2], axis=1).min()
     assert squashed < 0.9 * np.ptp(fall.positions[0, :, 2])
 

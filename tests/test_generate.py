@@ -236,7 +236,7 @@ def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
 
     def second(done: int, total: int) -> None:
         if done == 5:
-            with pytest.raises(GeneratorError, match="another process") as error:
+            with pytest.raises(DatasetError, match="another process") as error:
                 generate(fake, "smoke", tmp_path)
             errors.append(error)
 

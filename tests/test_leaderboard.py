@@ -1,6 +1,7 @@
 """Records, tables, and the check: it must pass on the truth and fail on every planted error."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,9 +16,11 @@ from m3gn_bench.checkpoint import read_description
 from m3gn_bench.cli import run
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.generators import sheet_deformation
-from m3gn_bench.leaderboard import check, record, render
+from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.leaderboard import check, record, render, submission, summary
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
 from m3gn_bench.metrics import TrajectoryErrors
+from m3gn_bench.tasks import get_task
 
 
 @pytest.fixture(scope="module")
@@ -179,22 +182,110 @@ def test_page_holds_every_recorded_number_in_order(board: Path) -> None:
     assert len(rows) == 4
     for stored in records:
         (cells,) = [row.split(" | ") for row in rows if row.startswith(f"| {stored.model} ") and "[" in row]
-        for result, cell in zip(stored.results, cells[4:], strict=True):
+        for result, cell in zip(stored.results, cells[4:7], strict=True):
             assert float(cell.split()[0]) == pytest.approx(result.mse * 1e6, rel=0.005)
     better, worse = sorted(records, key=lambda r: r.results[1].mse)
     assert page.index(f"| {better.model} ") < page.index(f"| {worse.model} ")
 
 
+def with_errors(record: ResultRecord, seed: int, factor: float) -> ResultRecord:
+    """The record of another seed whose errors are so many times as large."""
+    values = record.model_dump() | {"seed": seed}
+    for result in values["results"]:
+        for name in ("mse", "mse_free_nodes"):
+            result[name] *= factor
+        for name in ("ci95", "per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
+            result[name] = [factor * value for value in result[name]]
+    return ResultRecord.model_validate(values)
+
+
+def test_seeds_are_put_together(board: Path) -> None:
+    """Means and intervals are over seeds and trajectories, and models are compared on both."""
+    one = next(r for r in read_records(board) if r.model == "mgn")
+    records = [one, with_errors(one, 1, 3.0)]
+    (entry,) = summary.entries(records, one.track, one.task)
+    assert entry.seeds == 2
+    estimate = entry.estimate(5)
+    assert estimate.mean == pytest.approx(2 * one.results[1].mse)
+    assert estimate.low < one.results[1].mse < 3 * one.results[1].mse < estimate.high
+    single, large = (summary.Entry((r,)) for r in records)
+    assert summary.probability_of_less(single, large, 5) == 1
+    assert summary.probability_of_less(single, single, 5) == 0.5
+    # Of two seeds one is as good as the single one, the other worse.
+    assert 0.5 < summary.probability_of_less(single, entry, 5) < 1
+    with pytest.raises(ValueError, match="different trajectories"):
+        summary.probability_of_less(single, summary.Entry((one.model_copy(update={"keys": ()}),)), 5)
+
+
 def test_shipped_records_and_page_agree(capsys: pytest.CaptureFixture[str]) -> None:
-    """The committed page is what the committed records give, and every record has its checkpoint."""
+    """The committed page is what the committed records give, and checkpoints are where records say."""
     with pytest.raises(SystemExit) as stop:
         run(["leaderboard", "render", "--check"])
     assert stop.value.code == 0, capsys.readouterr().out
     shipped = read_records()
     assert shipped
+    folders = set()
     for stored in shipped:
-        folder = record.checkpoint_folder(stored.task, stored.model, stored.preset, stored.seed)
-        assert read_description(folder) == stored.checkpoint
+        if stored.ships:
+            folder = record.checkpoint_folder(stored.task, stored.model, stored.preset, stored.seed)
+            assert read_description(folder) == stored.checkpoint
+            folders.add(folder)
+    assert folders == {path.parent for path in (record.HOME / "checkpoints").rglob("checkpoint.json")}
+    assert sum(path.stat().st_size for folder in folders for path in folder.iterdir()) < 25 * 2**20
+
+
+def test_shipped_records_are_of_these_datasets() -> None:
+    """A change of a scene asks for new records."""
+    for stored in read_records():
+        assert stored.dataset_version == get_scene(get_task(stored.task).scene).dataset_version, stored.name
+
+
+@pytest.fixture
+def submitted(board: Path) -> ResultRecord:
+    return next(r for r in read_records(board) if r.model == "mgn").model_copy(update={"track": "theirs"})
+
+
+def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: Path) -> None:
+    """By the command that its author is told to use, beside what is there."""
+    home = tmp_path / "home"
+    shutil.copytree(board / "records", home / "records")
+    path = write_record(submitted, tmp_path / "theirs")
+    with pytest.raises(SystemExit) as stop:
+        run(["leaderboard", "submit", str(path), "--home", str(home)])
+    assert stop.value.code == 0
+    assert submitted in read_records(home)
+    with pytest.raises(SystemExit) as stop:
+        run(["leaderboard", "submit", str(path), "--home", str(home)])
+    assert stop.value.code == 1  # it is there already
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"task": "sheet"}, "unknown task 'sheet'"),
+        ({"split": "validation"}, "boards are of the test split"),
+        ({"dataset_version": "0.9"}, "dataset version is 0.9"),
+        ({"parameters": 7}, "parameters with these settings, not 7"),
+        ({"seed": 3}, "description is of another run"),
+        ({"keys": ("test_00003", "test_00002", "test_00001", "test_00000")}, "other trajectories"),
+        ({"track": "test"}, "already"),
+        ({"record_schema": 1}, "record_schema"),
+    ],
+)
+def test_what_is_wrong_with_a_submission_is_named(
+    board: Path, submitted: ResultRecord, changes: dict[str, object], reason: str
+) -> None:
+    verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
+    assert any(reason in problem for problem in verdict.problems), verdict
+
+
+def test_a_submission_on_other_bits_or_by_an_unknown_model_is_remarked(
+    board: Path, submitted: ResultRecord
+) -> None:
+    other = submitted.model_copy(update={"trajectory_hashes": ("0" * 16, *submitted.trajectory_hashes[1:])})
+    verdict = submission.review(other, read_records(board))
+    assert not verdict.problems
+    assert "1 of 4 trajectories differ" in verdict.remarks[0]
 
 
 def test_evaluation_is_deterministic(

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from m3gn_bench import stability, tradeoff
 from m3gn_bench.cli import cli
 from m3gn_bench.errors import ConfigError
+from m3gn_bench.figures import save
 from m3gn_bench.generators.deformable_block import DeformableBlock
 from m3gn_bench.generators.extremes import Extreme, Extremes, extremes_of
 from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
@@ -23,7 +24,7 @@ from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.stability import MODEL_CELLS, REASONED
 from m3gn_bench.studies import Cell, Result, Shipped, Study
-from m3gn_bench.study_page import draw, is_converged, read_records, render, save
+from m3gn_bench.study_page import draw, is_converged, read_records, render
 from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")

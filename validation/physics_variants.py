@@ -408,7 +408,7 @@ def tissue_outline(positions: Array) -> Array:
 
 # -- falling bodies -----------------------------------------------------------------------------------------
 
-IMPACT = 32  # the first frame after contact
+IMPACT = falling.flight_frames(falling.HEIGHT)  # the first frame after contact
 COMPARED = slice(IMPACT + 1, IMPACT + 21)  # from then until 0.2 s after the impact
 RINGING = slice(IMPACT + 48, IMPACT + 53)  # about 0.5 s after it
 
@@ -434,7 +434,7 @@ def fall(
     viscosity: float = falling.VISCOSITY,
     pushed_apart: bool = False,
 ) -> Fall:
-    """The scene's drop of 0.5 m until half a second after the impact, with all nodes looked at.
+    """The scene's drop until half a second after the impact, with all nodes looked at.
 
     Args:
         parameters: the draw.

@@ -23,7 +23,7 @@ from m3gn_bench.generators.solvers.tetrahedra import Element
 TEDDY = FallingTeddy()
 DEFAULT = TEDDY.fidelities["default"]
 COURANT = DEFAULT.courant
-IMPACT = 32  # first frame after contact
+IMPACT = falling.flight_frames(falling.HEIGHT)  # first frame after contact
 SOON, LATER = IMPACT + 10, IMPACT + 20  # 0.1 and 0.2 s after it
 
 

@@ -1,0 +1,218 @@
+"""A plan of training runs, carried out: train, score, put on record, and never do anything twice.
+
+A plan is a TOML file. Its head names the board and the data; every table `[[runs]]` is a grid of runs:
+
+    track = "compact"
+    tier = "paper"              # default
+    split = "test"              # default; "validation" for trials of hyper-parameters
+
+    [[runs]]
+    tasks = ["deformable_block"]
+    models = ["m3gn", "mgn"]
+    seeds = [0, 1, 2]
+    shipped_seeds = [0]         # whose checkpoints are kept beside the records
+    preset = "compact"          # default
+    minutes = 10                # CPU minutes of training; or steps = 1000; neither for models that do not learn
+    variant = "large rate"      # what is different here, if anything
+    settings = { "training.learning_rate" = 4e-3 }
+    materials = { youngs_modulus = [10, 1000] }  # only trajectories of these, in all splits
+"""
+
+import shutil
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from m3gn_bench.data import Materials, load_cases
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.file import content_hash, open_file, read_metadata
+from m3gn_bench.datasets.schema import TIERS, Record, Split
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.record import (
+    ResultRecord,
+    checkpoint_folder,
+    find_record,
+    run_name,
+    write_record,
+)
+from m3gn_bench.leaderboard.scoring import score
+from m3gn_bench.model import RunConfig, build_model, load_preset
+from m3gn_bench.tasks import get_task
+from m3gn_bench.training import require_budget, train
+
+PLANS = Path(__file__).parent / "plans"
+State = Literal["done", "outdated", "to do"]
+
+
+class Grid(Record):
+    """All combinations of some tasks, models and seeds."""
+
+    tasks: tuple[str, ...] = Field(min_length=1)
+    models: tuple[str, ...] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    shipped_seeds: tuple[int, ...] = ()
+    preset: str = "compact"
+    minutes: float | None = None
+    steps: int | None = None
+    variant: str = Field(default="", pattern=r"^[\w .+=-]*$")  # it becomes part of file names
+    settings: dict[str, Any] = Field(default={})
+    materials: Materials = Field(default={})
+
+
+class Plan(Record):
+    """What a campaign's file says."""
+
+    track: str = Field(pattern=r"^\w+$")
+    tier: str = "paper"
+    split: Split = "test"
+    runs: tuple[Grid, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a plan: what it is called, what is trained on what, and whether its checkpoint ships."""
+
+    track: str
+    task: str
+    seed: int
+    variant: str
+    config: RunConfig
+    materials: Materials
+    tier: str
+    split: Split
+    ships: bool
+
+    @property
+    def name(self) -> str:
+        """Unique within its track and task."""
+        return run_name(self.config.model_name, self.config.preset, self.variant, self.seed)
+
+    def state(self, records: Sequence[ResultRecord], dataset_version: str) -> State:
+        """Whether there is a record of this very run on data of that version."""
+        found = find_record(records, self.track, self.task, self.name)
+        if found is None:
+            return "to do"
+        same = (
+            found.checkpoint.config.model_dump() == self.config.to_json()
+            and found.dataset_version == dataset_version
+            and (found.tier, found.split, found.materials) == (self.tier, self.split, self.materials)
+        )
+        return "done" if same else "outdated"
+
+
+def read_plan(path: Path) -> list[PlannedRun]:
+    """The runs of a plan: all models and tasks with the first seed come before any with the second.
+
+    Raises:
+        ConfigError: the file is no plan, names something unknown, or plans a run twice.
+    """
+    try:
+        plan = Plan.model_validate(tomllib.loads(path.read_text()))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    if plan.tier not in TIERS:
+        raise ConfigError(f"{path}: tier: unknown {plan.tier!r}; known: {', '.join(TIERS)}")
+    runs = []
+    for number, grid in enumerate(plan.runs, 1):
+        try:
+            runs += [
+                _planned(plan, grid, task, model, seed)
+                for seed in grid.seeds
+                for task in grid.tasks
+                for model in grid.models
+            ]
+        except ConfigError as error:
+            raise ConfigError(f"{path}: runs, table {number}: {error}") from error
+    names = [(run.task, run.name) for run in runs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError(f"{path} plans {twice[0]}/{twice[1]} twice; name one of them by a variant")
+    return sorted(runs, key=lambda run: run.seed)
+
+
+def _planned(plan: Plan, grid: Grid, task_name: str, model: str, seed: int) -> PlannedRun:
+    task = get_task(task_name)
+    budget = {"training.minutes": grid.minutes, "training.steps": grid.steps}
+    settings = grid.settings | {key: value for key, value in budget.items() if value is not None}
+    config = load_preset(model, grid.preset, task, settings)
+    require_budget(config, build_model(config, task).is_learned)
+    return PlannedRun(
+        track=plan.track,
+        task=task_name,
+        seed=seed,
+        variant=grid.variant,
+        config=config,
+        materials=grid.materials,
+        tier=plan.tier,
+        split=plan.split,
+        ships=seed in grid.shipped_seeds,
+    )
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process needs to carry out a run.
+
+    Attributes:
+        run: which one.
+        dataset: file with all splits of the run's tier.
+        runs: folder of unfinished and finished training runs.
+        home: the leaderboard's folder.
+    """
+
+    run: PlannedRun
+    dataset: Path
+    runs: Path
+    home: Path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run: its record, or why there is none."""
+
+    run: PlannedRun
+    record: ResultRecord | None
+    error: str | None
+
+
+def carry_out(job: Job) -> Outcome:
+    """Train (or go on), score, and write the record; errors of the run are returned, for others can go on."""
+    run = job.run
+    task = get_task(run.task)
+    try:
+        with open_file(job.dataset) as file:
+            version = read_metadata(file).dataset_version
+            dataset_hash = content_hash(file, run.tier, ("train", "validation"))
+        training, validation = (
+            load_cases(job.dataset, task, split, run.tier, run.materials) for split in ("train", "validation")
+        )
+        # An older run of that name, with other settings or data, is no obstacle.
+        budget = run.config.training
+        stamp = f"{run.config.hash()[:8]}-{budget.minutes or budget.steps or 0:g}-{version}"
+        folder = job.runs / run.track / run.task / f"{run.name}-{stamp}"
+        train(run.config, task, training, validation, folder, seed=run.seed, dataset_hash=dataset_hash)
+        record = score(
+            folder,
+            job.dataset,
+            track=run.track,
+            tier=run.tier,
+            split=run.split,
+            variant=run.variant,
+            materials=run.materials,
+            ships=run.ships,
+        )
+    except BenchError as error:
+        return Outcome(run, None, str(error))
+    if run.ships:
+        shipped = checkpoint_folder(run.task, run.config.model_name, run.config.preset, run.seed, job.home)
+        shutil.rmtree(shipped, ignore_errors=True)
+        shutil.copytree(folder, shipped)
+    write_record(record, job.home)
+    return Outcome(run, record, None)

@@ -1,0 +1,99 @@
+"""Score a trained model on a split: predict, measure, and put everything on record."""
+
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.data import Materials, load_cases
+from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, stored_hashes
+from m3gn_bench.datasets.schema import Split
+from m3gn_bench.evaluation import evaluate_model
+from m3gn_bench.leaderboard.record import HASH_DIGITS, ContextResult, ResultRecord
+from m3gn_bench.tasks import get_task
+from m3gn_bench.version import __version__
+
+
+def score(
+    checkpoint: Path,
+    dataset: Path,
+    *,
+    track: str,
+    tier: str,
+    split: Split = "test",
+    contexts: Sequence[int] | None = None,
+    variant: str = "",
+    materials: Materials | None = None,
+    ships: bool = False,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ResultRecord:
+    """The record of a checkpoint's errors on a split of the data.
+
+    Args:
+        checkpoint: folder of a finished training run.
+        dataset: file that holds the tier and split of the checkpoint's task.
+        track: which board the record is for.
+        tier, split: which trajectories.
+        contexts: numbers of context frames; the task's own if None.
+        variant: what differs from the model's preset, in a word.
+        materials: only trajectories of these materials.
+        ships: whether the checkpoint is kept beside the records.
+        on_progress: called with (done, total) after every batch.
+
+    Raises:
+        CheckpointError, DatasetError: files that are damaged or do not fit.
+        BenchError: predictions that are not finite.
+    """
+    model, described = load_checkpoint(checkpoint)
+    task = get_task(described.task)
+    cases = load_cases(dataset, task, split, tier, materials)
+    start = time.perf_counter()
+    errors = evaluate_model(model, cases, contexts or task.context_sizes, on_progress)
+    seconds = time.perf_counter() - start
+    keys = tuple(case.keys[0] for case in cases)
+    with open_file(dataset) as file:
+        dataset_version = read_metadata(file).dataset_version
+        dataset_hash = content_hash(file, tier, (split,))
+        hashes = stored_hashes(file)
+    return ResultRecord(
+        track=track,
+        task=task.name,
+        model=described.config.model_name,
+        preset=described.config.preset,
+        variant=variant,
+        materials=materials or {},
+        seed=described.seed,
+        parameters=model.parameter_count(),
+        tier=tier,
+        split=split,
+        dataset_version=dataset_version,
+        dataset_hash=dataset_hash,
+        keys=keys,
+        trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),
+        package_version=__version__,
+        commit=_commit(),
+        evaluation_device="cpu",
+        evaluation_seconds=seconds,
+        checkpoint=described,
+        ships=ships,
+        results=tuple(ContextResult.from_errors(context, e) for context, e in errors.items()),
+    )
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
+    checkout = Path(__file__).parents[1]
+    if not (checkout / "pyproject.toml").is_file():
+        return None
+    git = ["git", "-C", str(checkout)]
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        # What the leaderboard holds is what is being made: it changes no number.
+        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/*.md"]
+        status = subprocess.run(
+            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")

@@ -1,0 +1,79 @@
+"""Take a record that somebody else made onto the board, if it is what it says."""
+
+from collections.abc import Sequence
+
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
+from m3gn_bench.model import RunConfig, build_model, model_names
+from m3gn_bench.tasks import TASKS
+
+
+class Verdict(Record):
+    """What is wrong with a submission, and what its readers should know."""
+
+    problems: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = False) -> Verdict:
+    """Compare a submission with what is on the board; its statistics were derived again when it was read.
+
+    Args:
+        record: the submission.
+        board: all records there are.
+        replace: whether it may take the place of the record of that name.
+    """
+    problems, remarks = [], []
+    if record.record_schema != RECORD_SCHEMA:
+        problems.append(
+            f"record_schema is {record.record_schema}, not {RECORD_SCHEMA}: make it with this version"
+        )
+    if record.task not in TASKS:
+        return Verdict(problems=(unknown_name("task", record.task, list(TASKS)),), remarks=())
+    if record.split != "test" and record.track != "tuning":
+        problems.append(f"split is {record.split!r}, but boards are of the test split")
+    contexts = tuple(result.context for result in record.results)
+    if contexts != TASKS[record.task].context_sizes:
+        problems.append(f"context sizes are {contexts}, not the task's {TASKS[record.task].context_sizes}")
+    if find_record(board, record.track, record.task, record.name) is not None and not replace:
+        problems.append(
+            f"there is a record of {record.task}/{record.name} already; give --replace to replace it"
+        )
+    described = record.checkpoint
+    stated = (described.task, described.config.model_name, described.config.preset, described.seed)
+    if stated != (record.task, record.model, record.preset, record.seed):
+        problems.append(f"the checkpoint's description is of another run: {'/'.join(map(str, stated))}")
+    if record.model in model_names():
+        config = RunConfig.from_json(described.config.model_dump())
+        if config.hash() != described.config_hash:
+            problems.append("config_hash is not that of the configuration")
+        count = build_model(config, TASKS[record.task]).parameter_count()
+        if count != record.parameters:
+            problems.append(f"the model has {count} parameters with these settings, not {record.parameters}")
+    else:
+        remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
+
+    peers = [
+        peer
+        for peer in board
+        if (peer.task, peer.tier, peer.split, peer.materials)
+        == (record.task, record.tier, record.split, record.materials)
+    ]
+    if not peers:
+        remarks.append("nothing on the board was scored on such trajectories: the data were not compared")
+        return Verdict(problems=tuple(problems), remarks=tuple(remarks))
+    peer = peers[0]
+    if record.dataset_version != peer.dataset_version:
+        problems.append(f"dataset version is {record.dataset_version}, not {peer.dataset_version}")
+    if record.keys != peer.keys:
+        problems.append(f"it has other trajectories than {peer.task}/{peer.name}, or another order of them")
+    else:
+        pairs = zip(record.trajectory_hashes, peer.trajectory_hashes, strict=True)
+        different = sum(own != theirs for own, theirs in pairs)
+        if different:
+            remarks.append(
+                f"{different} of {len(record.keys)} trajectories differ in some bit from those on record; on another "
+                "kind of processor they may ('m3gn-bench reproduce' tells whether by more than rounding)"
+            )
+    return Verdict(problems=tuple(problems), remarks=tuple(remarks))

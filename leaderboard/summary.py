@@ -1,0 +1,123 @@
+"""Records of the same run with several seeds, put together: what tables, figures and claims are made from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from m3gn_bench.leaderboard.record import ResultRecord
+from m3gn_bench.metrics import bootstrap_means
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean error with its 95 % interval over seeds and trajectories."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One row of a board: a model (and what is special about it) on a task, over all its seeds.
+
+    Attributes:
+        records: one per seed, all on the same trajectories.
+        keys: the trajectories that count; all if None.
+    """
+
+    records: tuple[ResultRecord, ...]
+    keys: tuple[str, ...] | None = None
+
+    def restricted_to(self, keys: tuple[str, ...]) -> "Entry":
+        """The same with only these trajectories."""
+        return Entry(self.records, keys)
+
+    @property
+    def label(self) -> str:
+        """The model, and the variant if there is one."""
+        first = self.records[0]
+        return f"{first.model} ({first.variant})" if first.variant else first.model
+
+    @property
+    def seeds(self) -> int:
+        """Number of seeds."""
+        return len(self.records)
+
+    @property
+    def parameters(self) -> int:
+        """Number of trainable parameters."""
+        return self.records[0].parameters
+
+    @property
+    def training_steps(self) -> float:
+        """Mean number over seeds."""
+        return float(np.mean([record.checkpoint.steps for record in self.records]))
+
+    @property
+    def training_minutes(self) -> float:
+        """Mean number over seeds."""
+        return float(np.mean([record.checkpoint.minutes for record in self.records]))
+
+    @cached_property
+    def contexts(self) -> tuple[int, ...]:
+        """Context sizes, ascending."""
+        return tuple(sorted(result.context for result in self.records[0].results))
+
+    def errors(self, context: int, free_nodes: bool = False) -> np.ndarray:
+        """Errors of every seed and trajectory, shape [seeds, trajectories]."""
+        found = [record.result(context) for record in self.records]
+        errors = np.array(
+            [r.trajectory_mse_free_nodes if free_nodes else r.trajectory_mse for r in found if r is not None]
+        )
+        if self.keys is None:
+            return errors
+        place = {key: number for number, key in enumerate(self.records[0].keys)}
+        return errors[:, [place[key] for key in self.keys]]
+
+    def estimate(self, context: int, free_nodes: bool = False) -> Estimate:
+        """Mean error at a context size and its interval."""
+        errors = self.errors(context, free_nodes)
+        low, high = np.percentile(bootstrap_means([errors]), [2.5, 97.5])
+        return Estimate(float(errors.mean()), float(low), float(high))
+
+    def per_timestep(self, context: int) -> np.ndarray:
+        """Mean error of every frame after the anchor, shape [horizon]."""
+        found = [record.result(context) for record in self.records]
+        return np.mean([r.per_timestep_mse for r in found if r is not None], axis=0)
+
+
+def probability_of_less(
+    first: Entry, second: Entry, context: int, second_context: int | None = None
+) -> float:
+    """Probability that the first has the lower mean error, over resampled seeds and common trajectories.
+
+    Args:
+        first, second: two rows.
+        context: number of context frames.
+        second_context: of the second row, if another.
+
+    Raises:
+        ValueError: they were not scored on the same trajectories.
+    """
+    if (first.keys or first.records[0].keys) != (second.keys or second.records[0].keys):
+        raise ValueError(f"{first.label} and {second.label} were scored on different trajectories")
+    ours, theirs = bootstrap_means([first.errors(context), second.errors(second_context or context)])
+    return float(np.mean(ours < theirs) + 0.5 * np.mean(ours == theirs))
+
+
+def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entry]:
+    """The rows of a board, best error at the middle context size first."""
+    groups: dict[tuple[str, str, str], list[ResultRecord]] = {}
+    for record in records:
+        if (record.track, record.task) == (track, task):
+            groups.setdefault((record.model, record.preset, record.variant), []).append(record)
+    found = [Entry(tuple(sorted(group, key=lambda r: r.seed))) for group in groups.values()]
+    return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
+
+
+def middle(contexts: Sequence[int]) -> int:
+    """The middle one of some context sizes."""
+    return sorted(contexts)[len(contexts) // 2]

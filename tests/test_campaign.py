@@ -1,0 +1,203 @@
+"""Plans: what they mean, what is done once, what goes on after a kill, and what fails loudly."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from m3gn_bench.baselines.mgn import MeshGraphNet
+from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.cli import run
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.campaign import PLANS, Job, carry_out, read_plan
+from m3gn_bench.leaderboard.check import compare_with_retrained
+from m3gn_bench.leaderboard.record import checkpoint_folder, read_records
+
+SCRIPT = Path(sys.executable).parent / "m3gn-bench"
+HEAD = 'track = "trial"\ntier = "smoke"\n'
+GRID = """
+[[runs]]
+tasks = ["sheet_deformation"]
+models = ["mgn"]
+preset = "smoke"
+steps = 3
+"""
+
+
+def write(folder: Path, *grids: str, head: str = HEAD) -> Path:
+    path = folder / "plan.toml"
+    path.write_text(head + "".join(grids))
+    return path
+
+
+def campaign(plan: Path, data: Path, *options: str, workers: int = 1) -> list[str]:
+    """Arguments of the command; results go beside the plan."""
+    home, runs = (str(plan.parent / name) for name in ("home", "runs"))
+    places = ["--home", home, "--runs", runs, "--data", str(data), "--workers", str(workers)]
+    return ["campaign", str(plan), *places, *options]
+
+
+def carry(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, object]]:
+    """Exit code and JSON of the command."""
+    with pytest.raises(SystemExit) as stop:
+        run([*arguments, "--json"])
+    return int(stop.value.code or 0), json.loads(capsys.readouterr().out)
+
+
+def test_a_plan_is_carried_out_once(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = write(
+        tmp_path,
+        GRID + "seeds = [0, 1]\nshipped_seeds = [1]\nmaterials = { youngs_modulus = [10, 30, 60] }\n",
+        GRID + 'variant = "hasty"\nsettings = { "training.learning_rate" = 0.01 }\n',
+    )
+    command = campaign(plan, smoke_file.parent)
+    code, before = carry([*command, "--status"], capsys)
+    assert (code, before["counts"]) == (0, {"done": 0, "outdated": 0, "to do": 3})
+    code, after = carry(command, capsys)
+    assert (code, after["counts"]) == (0, {"done": 3, "outdated": 0, "to do": 0})
+    home = tmp_path / "home"
+    records = {record.name: record for record in read_records(home)}
+    assert set(records) == {"mgn-smoke-s0", "mgn-smoke-s1", "mgn-smoke-hasty-s0"}
+    assert len(records["mgn-smoke-s0"].keys) == 3  # of four test trajectories one is of 100 MPa
+    assert records["mgn-smoke-hasty-s0"].checkpoint.config.training["learning_rate"] == 0.01
+    assert [name for name, record in records.items() if record.ships] == ["mgn-smoke-s1"]
+    _, shipped = load_checkpoint(checkpoint_folder("sheet_deformation", "mgn", "smoke", 1, home))
+    assert shipped == records["mgn-smoke-s1"].checkpoint
+
+    written = {path: path.stat().st_mtime_ns for path in home.rglob("*") if path.is_file()}
+    carry(command, capsys)
+    assert {path: path.stat().st_mtime_ns for path in home.rglob("*") if path.is_file()} == written
+
+    write(tmp_path, GRID.replace("steps = 3", "steps = 2"))
+    _, changed = carry([*command, "--status"], capsys)
+    assert changed["counts"] == {"done": 0, "outdated": 1, "to do": 0}
+    carry(command, capsys)
+    again = next(record for record in read_records(home) if record.name == "mgn-smoke-s0")
+    assert again.checkpoint.steps == 2
+
+
+def test_a_failing_run_does_not_stop_the_others(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    diverging = GRID + 'variant = "wild"\nsettings = { "training.learning_rate" = 1e30 }\n'
+    plan = write(tmp_path, diverging, GRID)
+    code, outcome = carry(campaign(plan, smoke_file.parent), capsys)
+    assert code == 1
+    assert outcome["counts"] == {"done": 1, "outdated": 0, "to do": 1}
+    ((name, problem),) = outcome["problems"].items()  # type: ignore[attr-defined]
+    assert name == "sheet_deformation/mgn-smoke-wild-s0"
+    assert "learning_rate" in problem
+
+
+def test_a_killed_campaign_goes_on(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Workers end with the campaign, finished runs stay, and in the end the records are those of an undisturbed one."""
+    grid = GRID.replace("steps = 3", "steps = 20") + "seeds = [0, 1, 2]\n"
+    plan = write(tmp_path, grid)
+    command = [str(SCRIPT), *campaign(plan, smoke_file.parent, workers=2)]
+    with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120
+        while not list((tmp_path / "home").rglob("*-s?.json")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 30
+    while _alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not _alive(process.pid)
+    assert carry(campaign(plan, smoke_file.parent), capsys)[0] == 0
+    undisturbed = tmp_path / "undisturbed"
+    undisturbed.mkdir()
+    carry(campaign(write(undisturbed, grid), smoke_file.parent), capsys)
+
+    def errors(home: Path) -> dict[str, object]:
+        return {r.name: [x.trajectory_mse for x in r.results] for r in read_records(home)}
+
+    assert errors(tmp_path / "home") == errors(undisturbed / "home")
+
+
+def _alive(session: int) -> bool:
+    """Whether any process of a session lives."""
+    try:
+        os.killpg(session, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("track = ", "cannot read"),
+        (HEAD, "runs"),
+        (HEAD + GRID + "minute = 3\n", r"runs.0.minute"),
+        (HEAD + GRID.replace("mgn", "magnet"), "unknown model 'magnet'"),
+        (HEAD + GRID.replace("sheet_deformation", "sheet"), "table 1: unknown task 'sheet'"),
+        (HEAD + GRID.replace("steps = 3", ""), "give a budget"),
+        (HEAD + GRID + "minutes = 3\n", "give a budget"),
+        (HEAD + GRID + 'settings = { "training.rate" = 1 }\n', "unknown configuration key 'training.rate'"),
+        (HEAD + GRID + GRID, "twice"),
+        (HEAD.replace("smoke", "small") + GRID, "unknown 'small'"),
+        (HEAD + GRID + 'variant = "a/b"\n', r"runs.0.variant"),
+    ],
+)
+def test_a_wrong_plan_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=reason):
+        read_plan(path)
+
+
+def test_an_unknown_material_is_a_problem_of_its_run(smoke_file: Path, tmp_path: Path) -> None:
+    (planned,) = read_plan(write(tmp_path, GRID + "materials = { density = [1] }\n"))
+    outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs", tmp_path / "home"))
+    assert outcome.record is None
+    assert "unknown material parameter 'density'; known: youngs_modulus" in str(outcome.error)
+
+
+def test_shipped_plans_can_be_read() -> None:
+    """And give every method the same time and the same trials."""
+    plans = {path.stem: read_plan(path) for path in PLANS.glob("*.toml")}
+    assert {"compact", "ablations", "tuning", "smoke"} <= set(plans)
+    for name in ("compact", "ablations", "tuning"):
+        assert len({run.config.training.minutes for run in plans[name]} - {None}) == 1
+    trials = dict.fromkeys({run.config.model_name for run in plans["tuning"]}, 0)
+    for planned in plans["tuning"]:
+        assert planned.split == "validation"
+        trials[planned.config.model_name] += 1
+    assert len(set(trials.values())) == 1
+    assert set(trials) == {
+        run.config.model_name for run in plans["compact"] if run.config.training.minutes is not None
+    }
+
+
+def test_planted_error_in_training_is_found(
+    smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training again gives the same errors, and others if the model's loss is not what it was."""
+    (planned,) = read_plan(write(tmp_path, GRID.replace("steps = 3", "steps = 12")))
+
+    def trained(name: str) -> object:
+        job = Job(planned, smoke_file, tmp_path / name / "runs", tmp_path / name / "home")
+        return carry_out(job).record
+
+    recorded = trained("first")
+    same = compare_with_retrained([recorded], [trained("second")])  # type: ignore[list-item]
+    assert same.ok
+    assert all(c.relative_difference == 0 and c.same_trajectory for c in same.compared)
+
+    original = MeshGraphNet.training_loss
+    monkeypatch.setattr(
+        MeshGraphNet, "training_loss", lambda self, case, rng: original(self, case, rng).sqrt()
+    )
+    assert not compare_with_retrained([recorded], [trained("third")]).ok  # type: ignore[list-item]
+    assert not compare_with_retrained([recorded], [None]).ok  # type: ignore[list-item]
