@@ -102,6 +102,57 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
     sys.exit(1 if check and not all(current.values()) else 0)
 
 
+@leaderboard.command()
+@click.option("--task", "task_name", default=None, help="Only this task.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder of the pictures (in a checkout: leaderboard/figures).",
+)
+@click.option("--tier", default="paper", show_default=True, help="Which test trajectories.")
+@WORKERS
+@DATA
+@JSON
+def pictures(task_name: str | None, output: Path, tier: str, workers: int, data: Path, as_json: bool) -> None:
+    """Draw what the shipped checkpoints do: final frames over the truth, and M3GN's task descriptions (t-SNE).
+
+    Test trajectories are simulated first if they are not there yet. Needs the extra `plot`.
+    """
+    from m3gn_bench.checkpoint import load_checkpoint
+    from m3gn_bench.data import load_cases
+    from m3gn_bench.figures import require_drawable, save
+    from m3gn_bench.leaderboard.pictures import draw_latents, draw_overlays
+    from m3gn_bench.leaderboard.record import HOME, checkpoint_folder, read_records
+    from m3gn_bench.leaderboard.summary import middle
+    from m3gn_bench.m3gn import M3GN
+    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.tasks import TASKS, get_task
+
+    report = Report(as_json)
+    require_drawable(output / "picture.png")
+    names = list(TASKS) if task_name is None else [get_task(task_name).name]
+    records = [r for r in read_records() if r.ships and r.track == "compact" and r.checkpoint.steps > 0]
+    written = []
+    for name in names:
+        task = get_task(name)
+        shown = [record for record in records if record.task == name]
+        if not any(record.model == "m3gn" for record in shown):
+            continue
+        with report.progress(f"simulating {task.scene}") as on_progress:
+            path = find_or_generate(
+                task, tier, data, splits=("test",), workers=workers, on_progress=on_progress
+            )
+        save(draw_overlays(shown, task, path, tier, HOME), output / f"overlay-{name}.png")
+        model, _ = load_checkpoint(checkpoint_folder(name, "m3gn", "compact"))
+        assert isinstance(model, M3GN)
+        cases = load_cases(path, task, "test", tier)
+        save(draw_latents(model, cases, middle(task.context_sizes)), output / f"latent-{name}.png")
+        written += [str(output / f"{kind}-{name}.png") for kind in ("overlay", "latent")]
+    report.finish({"files": written}, *written, f"{len(written)} pictures")
+
+
 @leaderboard.command("check")
 @click.option("--task", "task_name", default=None, help="Only this task.")
 @click.option("--trajectories", type=click.IntRange(min=1), default=3, show_default=True, help="Per record.")

@@ -1,0 +1,114 @@
+"""Pictures of what the shipped models do: final frames over the truth, and what M3GN tells materials apart by."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.data import Case, load_cases, mesh_edges
+from m3gn_bench.datasets.reader import TrajectoryDataset
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder
+from m3gn_bench.leaderboard.summary import middle
+from m3gn_bench.m3gn import M3GN
+from m3gn_bench.tasks import Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+PERPLEXITY = 20.0  # of t-SNE, where there are trajectories enough
+
+
+def draw_overlays(
+    records: Sequence[ResultRecord], task: Task, dataset: "Path", tier: str, home: "Path"
+) -> "Figure":
+    """Predicted final frames (faces) and true ones (lines) of the trajectory whose error is M3GN's median.
+
+    Args:
+        records: whose checkpoints to run, on this task; M3GN's is among them.
+        task: what to predict.
+        dataset, tier: where the test trajectories are.
+        home: the leaderboard's folder, with the checkpoints.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    context = middle(task.context_sizes)
+    errors = next(r for r in records if r.model == "m3gn").result(context)
+    assert errors is not None
+    chosen = int(np.argsort(errors.trajectory_mse)[len(errors.trajectory_mse) // 2])
+    key = next(r for r in records if r.model == "m3gn").keys[chosen]
+    source = TrajectoryDataset(dataset, task.name, "test", tier)
+    triangles = source[source.keys.index(key)].mesh.cells
+    edges = mesh_edges(triangles).T
+    case = next(c for c in load_cases(dataset, task, "test", tier) if c.keys == (key,))
+
+    truth = case.positions[-1].numpy()
+    predictions = {}
+    for record in records:
+        folder = checkpoint_folder(task.name, record.model, record.preset, record.seed, home)
+        model, _ = load_checkpoint(folder)
+        with torch.inference_mode():
+            predictions[record.model] = model.predict(case.context(context))[-1].numpy()
+    distances = {name: np.linalg.norm(found - truth, axis=1) for name, found in predictions.items()}
+    colours = ScalarMappable(Normalize(0, max(float(d.max()) for d in distances.values())), "viridis")
+
+    columns = min(len(predictions), 3)
+    rows = -(-len(predictions) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.4 * rows), layout="constrained")
+    figure.suptitle(f"{task.title}, {key}, last frame after {context} context frames")
+    panels: list[Any] = []
+    for place, (name, predicted) in enumerate(predictions.items(), 1):
+        faces = colours.to_rgba(distances[name][triangles].mean(1))
+        if task.dimension == 3:
+            axes: Any = figure.add_subplot(rows, columns, place, projection="3d")
+            axes.add_collection3d(Poly3DCollection(predicted[triangles], facecolors=faces))
+            axes.add_collection3d(Line3DCollection(truth[edges], colors="0.2", linewidths=0.4))
+            axes.auto_scale_xyz(*np.concatenate([truth, predicted]).T)
+        else:
+            axes = figure.add_subplot(rows, columns, place)
+            axes.add_collection(PolyCollection(predicted[triangles], facecolors=faces))
+            axes.add_collection(LineCollection(truth[edges], colors="0.2", linewidths=0.4))
+            axes.autoscale()
+        axes.set(title=name, aspect="equal")
+        axes.set_axis_off()
+        panels.append(axes)
+    figure.colorbar(colours, ax=panels, label="distance from the truth, scaled", shrink=0.7)
+    return figure
+
+
+def draw_latents(model: M3GN, cases: Sequence[Case], context: int) -> "Figure":
+    """t-SNE of every test trajectory's task description (mean over nodes), coloured by its material.
+
+    Raises:
+        ConfigError: scikit-learn is missing.
+    """
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError as error:
+        raise ConfigError("t-SNE needs scikit-learn; pip install 'm3gn-bench[plot]'") from error
+    from matplotlib.figure import Figure
+
+    with torch.inference_mode():
+        latents = [
+            model.encoder(case.context(context), model.velocity_scale, None)[: case.body.nodes].mean(0)
+            for case in cases
+        ]
+    places = TSNE(perplexity=min(PERPLEXITY, (len(cases) - 1) / 3), random_state=0).fit_transform(torch.stack(latents).numpy())
+    materials = torch.cat([case.body.material for case in cases]).numpy()
+    names = [feature.name for feature in model.task.material]
+    figure = Figure(figsize=(4.5 * len(names), 4), layout="constrained")
+    figure.suptitle(f"{model.task.title}: task descriptions after {context} frames")
+    for number, name in enumerate(names):
+        axes = figure.add_subplot(1, len(names), number + 1)
+        shown = axes.scatter(*places.T, c=materials[:, number], cmap="viridis", s=14)
+        figure.colorbar(shown, label=f"{name}, scaled")
+        axes.set(xticks=[], yticks=[])
+    return figure
