@@ -101,7 +101,9 @@ def draw_latents(model: M3GN, cases: Sequence[Case], context: int) -> "Figure":
             model.encoder(case.context(context), model.velocity_scale, None)[: case.body.nodes].mean(0)
             for case in cases
         ]
-    places = TSNE(perplexity=min(PERPLEXITY, (len(cases) - 1) / 3), random_state=0).fit_transform(torch.stack(latents).numpy())
+    places = TSNE(perplexity=min(PERPLEXITY, (len(cases) - 1) / 3), random_state=0).fit_transform(
+        torch.stack(latents).numpy()
+    )
     materials = torch.cat([case.body.material for case in cases]).numpy()
     names = [feature.name for feature in model.task.material]
     figure = Figure(figsize=(4.5 * len(names), 4), layout="constrained")

@@ -44,6 +44,8 @@ def render(records: Sequence[ResultRecord]) -> str:
                 parts.append(_task_table(task.title, rows))
                 if track == "compact":
                     parts.append(f"![Errors over context frames and over time]({FIGURES}/{name}.svg)\n")
+        if track == "compact":
+            parts.append(_runtimes(records, track))
     return "\n".join(parts)
 
 
@@ -77,6 +79,28 @@ def _task_table(title: str, rows: Sequence[Entry]) -> str:
             "",
         ]
     return "\n".join(lines)
+
+
+def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
+    boards = {name: {row.label: row for row in entries(records, track, name)} for name in TASKS}
+    boards = {name: rows for name, rows in boards.items() if rows}
+    models = dict.fromkeys(label for rows in boards.values() for label in rows)
+    lines = [
+        "### Time per prediction",
+        "",
+        "Milliseconds for a trajectory, mean over context sizes; one thread, batches of four, two processes at once.",
+        "",
+        _row(["model", *(TASKS[name].title for name in boards)]),
+        _row(["---", *("--:" for _ in boards)]),
+    ]
+    for label in models:
+        found = [rows.get(label) for rows in boards.values()]
+        lines.append(
+            _row(
+                [label, *("" if row is None else f"{1e3 * row.seconds_per_prediction:.3g}" for row in found)]
+            )
+        )
+    return "\n".join([*lines, ""])
 
 
 def _cells(row: Entry, contexts: Sequence[int], m3gn: Entry | None) -> Iterable[str]:

@@ -61,6 +61,12 @@ class Entry:
         """Mean number over seeds."""
         return float(np.mean([record.checkpoint.minutes for record in self.records]))
 
+    @property
+    def seconds_per_prediction(self) -> float:
+        """Wall time of one prediction, in batches, with one thread as in a campaign; mean over seeds and contexts."""
+        predictions = len(self.records[0].keys) * len(self.contexts)
+        return float(np.mean([record.evaluation_seconds for record in self.records])) / predictions
+
     @cached_property
     def contexts(self) -> tuple[int, ...]:
         """Context sizes, ascending."""
