@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import click
 
-from m3gn_bench.console import JSON, Report, table
+from m3gn_bench.console import DATA, JSON, Report, table
 from m3gn_bench.dataset_commands import card, generate, info, reproduce, validate, view
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.leaderboard_commands import campaign, leaderboard
@@ -147,6 +148,26 @@ def list_command(as_json: bool) -> None:
             ],
         ),
     )
+
+
+@cli.command()
+@click.option("--self-test/--no-self-test", default=True, help="Simulate and predict, too (half a minute).")
+@DATA
+@JSON
+def doctor(self_test: bool, data: Path, as_json: bool) -> None:
+    """What is installed, what it can use, and whether it computes what it should; exit code 1 if not."""
+    from m3gn_bench.doctor import examine
+
+    report = Report(as_json)
+    with report.progress("looking") as on_progress:
+        findings = examine(data, self_test, on_progress)
+    wrong = [finding for finding in findings if finding.state == "wrong"]
+    report.finish(
+        {"ok": not wrong, "findings": [finding.model_dump(mode="json") for finding in findings]},
+        *(f"{f.part:12} {f.name:24} {f.state:8} {f.detail}" for f in findings),
+        f"{len(wrong)} of {len(findings)} things are wrong" if wrong else "everything is fine",
+    )
+    sys.exit(1 if wrong else 0)
 
 
 for command in (

@@ -23,7 +23,7 @@ ALLOWED = {
 }
 # These reach further, but only inside functions: a model can be evaluated without a simulator installed.
 COMMANDS = ("dataset_commands", "leaderboard_commands", "model_commands", "study_commands")
-LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", *COMMANDS, "sources", "stability", "tradeoff")}
+LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", *COMMANDS, "doctor", "sources", "stability", "tradeoff")}
 LAZILY_ALLOWED = {"generators", "leaderboard", "baselines"}
 
 

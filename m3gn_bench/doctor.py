@@ -1,0 +1,190 @@
+"""What this installation is, what it can use, and whether it computes what it should."""
+
+import os
+import platform
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.recorded import TOLERANCE, probe, read_record
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.version import __version__
+
+DISTRIBUTION = "m3gn-bench"
+PAPER_TIERS_GB = 2.5  # of all scenes together
+State = Literal["fine", "missing", "wrong"]
+
+
+class Finding(Record):
+    """One thing that was looked at.
+
+    Attributes:
+        part: what kind of thing it is.
+        name: which one.
+        state: "missing" is optional and no fault.
+        detail: what was found, or what to do.
+    """
+
+    part: str
+    name: str
+    state: State
+    detail: str
+
+
+def examine(data: Path, self_test: bool, on_progress: Callable[[int, int], None]) -> list[Finding]:
+    """Look at everything.
+
+    Args:
+        data: the folder where datasets would go.
+        self_test: also simulate a trajectory of every scene and run a shipped model, which takes half a minute.
+        on_progress: called with (done, total) after every part.
+    """
+    parts = [machine, libraries, devices, lambda: disk(data), meshes, board]
+    if self_test:
+        parts += [simulations, predictions]
+    found: list[Finding] = []
+    for done, part in enumerate(parts, 1):
+        found += part()
+        on_progress(done, len(parts))
+    return found
+
+
+def machine() -> Iterator[Finding]:
+    """The processor and the programs that everything runs on."""
+    from m3gn_bench.generators.generate import machine as processor
+
+    yield Finding(part="machine", name="m3gn-bench", state="fine", detail=__version__)
+    yield Finding(part="machine", name="Python", state="fine", detail=platform.python_version())
+    yield Finding(part="machine", name="system", state="fine", detail=platform.platform())
+    yield Finding(part="machine", name="processor", state="fine", detail=processor())
+    threads = {
+        name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ
+    }
+    limits = ", ".join(f"{name}={value}" for name, value in threads.items()) or "no limit set"
+    yield Finding(part="machine", name="threads", state="fine", detail=limits)
+
+
+def libraries() -> Iterator[Finding]:
+    """Every library that the package asks for, and the extras that would bring those that are missing."""
+    missing: dict[str, list[str]] = {}
+    for requirement in requires(DISTRIBUTION) or []:
+        name = re.split(r"[ <>=!~;\[(]", requirement, maxsplit=1)[0]
+        extra = re.search(r"extra == ['\"]([^'\"]+)['\"]", requirement)
+        if name == DISTRIBUTION or (extra is not None and extra[1] in ("test", "dev")):
+            continue
+        try:
+            yield Finding(part="library", name=name, state="fine", detail=version(name))
+        except PackageNotFoundError:
+            if extra is None:
+                detail = "required; install the package again"
+                yield Finding(part="library", name=name, state="wrong", detail=detail)
+            else:
+                missing.setdefault(extra[1], []).append(name)
+    for extra_name, names in missing.items():
+        advice = f"without {', '.join(names)}; pip install 'm3gn-bench[{extra_name}]'"
+        yield Finding(part="extra", name=extra_name, state="missing", detail=advice)
+
+
+def devices() -> Iterator[Finding]:
+    """What torch and Warp can compute on."""
+    import torch
+
+    vector = torch.backends.cpu.get_cpu_capability()
+    detail = f"{torch.get_num_threads()} threads, {vector}"
+    yield Finding(part="device", name="torch cpu", state="fine", detail=detail)
+    for number in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(number)
+        detail = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB"
+        yield Finding(part="device", name=f"torch cuda:{number}", state="fine", detail=detail)
+    if torch.backends.mps.is_available():
+        yield Finding(part="device", name="torch mps", state="fine", detail="Apple")
+    from m3gn_bench.generators.solvers.quiet_warp import wp
+
+    for device in wp.get_devices():
+        yield Finding(part="device", name=f"warp {device.alias}", state="fine", detail=device.name)
+
+
+def disk(data: Path) -> Iterator[Finding]:
+    """Room for datasets."""
+    place = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(place).free / 1e9
+    enough = free > PAPER_TIERS_GB
+    detail = f"{free:.1f} GB free; all paper tiers together take {PAPER_TIERS_GB} GB"
+    yield Finding(part="disk", name=str(place), state="fine" if enough else "missing", detail=detail)
+
+
+def meshes() -> Iterator[Finding]:
+    """Whether the objects that fall are those that were published."""
+    from m3gn_bench.generators.falling import MixedObjects
+    from m3gn_bench.generators.objects import load_object
+
+    for name in MixedObjects.objects:
+        try:
+            body = load_object(name)
+        except BenchError as error:
+            yield Finding(part="mesh", name=name, state="wrong", detail=str(error))
+        else:
+            detail = f"{len(body.tetrahedra)} tetrahedra, hash holds"
+            yield Finding(part="mesh", name=name, state="fine", detail=detail)
+
+
+def board() -> Iterator[Finding]:
+    """Whether records can be read and checkpoints that ship are there."""
+    from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.leaderboard.record import checkpoint_folder, read_records
+
+    try:
+        records = read_records()
+        shipped = [record for record in records if record.ships]
+        for record in shipped:
+            read_description(checkpoint_folder(record.task, record.model, record.preset, record.seed))
+    except BenchError as error:
+        yield Finding(part="leaderboard", name="records", state="wrong", detail=str(error))
+    else:
+        detail = f"{len(records)} records, {len(shipped)} with checkpoints"
+        yield Finding(part="leaderboard", name="records", state="fine", detail=detail)
+
+
+def simulations() -> Iterator[Finding]:
+    """One trajectory of every scene, simulated anew and compared with what is on record."""
+    from m3gn_bench.generators.generate import simulate_one
+    from m3gn_bench.generators.scene import get_scene, scene_names
+
+    for name in scene_names():
+        scene, start = get_scene(name), time.perf_counter()
+        try:
+            expected = read_record(name).probes["test_00000"]
+            trajectory, _ = simulate_one(scene, "test", 0)
+        except BenchError as error:
+            yield Finding(part="self-test", name=name, state="wrong", detail=str(error))
+            continue
+        difference = float(np.abs(np.subtract(probe(trajectory), expected)).max() / scene.scale_length)
+        right = difference <= TOLERANCE
+        detail = f"simulated in {time.perf_counter() - start:.1f} s; {difference:.1e} from the record (scaled units)"
+        yield Finding(part="self-test", name=name, state="fine" if right else "wrong", detail=detail)
+
+
+def predictions() -> Iterator[Finding]:
+    """One trajectory of every task with a shipped M3GN, predicted and compared with the record."""
+    from m3gn_bench.leaderboard.check import check_records
+    from m3gn_bench.leaderboard.record import read_records
+
+    for record in read_records():
+        if record.model != "m3gn" or not record.ships:
+            continue
+        name = f"m3gn on {record.task}"
+        try:
+            outcome = check_records([record], trajectories=1, offset=0)
+        except BenchError as error:
+            yield Finding(part="self-test", name=name, state="wrong", detail=str(error))
+            continue
+        largest = max((c.relative_difference for c in outcome.compared), default=float("nan"))
+        detail = "; ".join(outcome.problems) or f"error within {largest:.1e} of the record"
+        yield Finding(part="self-test", name=name, state="fine" if outcome.ok else "wrong", detail=detail)
