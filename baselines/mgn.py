@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from m3gn_bench.data import Body, Case, Context
+from m3gn_bench.errors import ConfigError
 from m3gn_bench.graph import build_graph
 from m3gn_bench.message_passing import MessagePassingNetwork
 from m3gn_bench.model import Model, ModelConfig
@@ -149,6 +150,10 @@ class MeshGraphNet(Model):
 
     def __init__(self, task: Task, config: StepConfig) -> None:
         super().__init__(task, config)
+        if self.uses_material and not task.material:
+            raise ConfigError(
+                "this model is told the material, which the data do not tell; take another model"
+            )
         self.simulator = StepSimulator(task, config, len(task.material) * self.uses_material)
 
     def predict(self, context: Context) -> Tensor:

@@ -15,10 +15,12 @@ from m3gn_bench.datasets.schema import (
     SPLITS,
     TIERS,
     Metadata,
+    as_split,
     as_text,
     in_tier,
     parse_key,
     tier_sizes,
+    trajectory_key,
 )
 from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
 
@@ -145,6 +147,23 @@ def read_splits(file: h5py.File) -> dict[str, dict[str, list[str]]]:
             task: {split: [key.decode() for key in _array(group, split)] for split in group}
             for task, group in file["splits"].items()
         }
+
+
+def find_key(file: h5py.File, split: str, index: int) -> str:
+    """The key of a trajectory. Raises DatasetError with what there is instead."""
+    wanted, keys = as_split(split), list(stored_hashes(file))
+    count = sum(parse_key(key)[0] == wanted for key in keys)
+    if not count:
+        present = sorted({parse_key(key)[0] for key in keys})
+        raise DatasetError(
+            f"{file.filename} has no {split} trajectories; it has {' and '.join(present) or 'none'}"
+        )
+    key = trajectory_key(split, index)
+    if key not in keys:
+        raise DatasetError(
+            f"index {index} is out of range: {file.filename} has {count} {split} trajectories, 0 to {count - 1}"
+        )
+    return key
 
 
 def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str] = SPLITS) -> str:

@@ -29,6 +29,8 @@ from m3gn_bench.datasets.errors import DatasetError, unknown_name
 FORMAT = "m3gn-bench dataset"
 SCHEMA_VERSION = 1
 DATASET_SEED = 2025  # the leaderboard's
+NO_SEED = -1  # of data that were not drawn here
+IMPORTED = "imported"  # in a variant: the layout that the data of others had
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -99,6 +101,11 @@ class Metadata(Record):
     def is_benchmark(self) -> bool:
         """Whether everybody is meant to have this dataset: the scene's own options, fidelity and seed."""
         return (self.fidelity, self.variant, self.seed) == ("default", {}, DATASET_SEED)
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether others made the data (see `imports`)."""
+        return IMPORTED in self.variant
 
     def to_attributes(self) -> dict[str, Any]:
         """HDF5 attributes: numbers as they are, strings as bytes (of fixed length), everything else as JSON."""

@@ -9,7 +9,8 @@ import fcntl
 import io
 import os
 import re
-from collections.abc import Callable, Iterator
+import secrets
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,7 +32,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         DatasetError: the operating system refuses (no space, no permission), in one line.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Processes of several machines may write the same file.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -87,8 +89,9 @@ def write_shard(path: Path, key: str, trajectory: Trajectory, metadata: Metadata
 def _write_trajectory(file: h5py.File, key: str, trajectory: Trajectory) -> str:
     mesh_arrays = trajectory.mesh.arrays()
     mesh_name = f"meshes/{hash_arrays(mesh_arrays).hexdigest()[:16]}"
-    for name, array in mesh_arrays.items():
-        _write_array(file, f"{mesh_name}/{name}", array)
+    if mesh_name not in file:
+        for name, array in mesh_arrays.items():
+            _write_array(file, f"{mesh_name}/{name}", array)
     group = file.create_group(f"trajectories/{key}")
     group["mesh"] = file[mesh_name]
     for name, array in trajectory.arrays().items():
@@ -154,11 +157,37 @@ def merge_shards(
                 for task in tasks_of(split, dict(origin["material"].attrs)):
                     members.setdefault(f"splits/{task}/{split}", []).append(key)
                 rejections += Metadata.from_attributes(dict(source.attrs)).rejections
-        for name, keys in members.items():
-            file.create_dataset(name, data=np.array(keys, "S"), chunks=(len(keys),), fletcher32=True)
-        content_hash = combine_hashes(hashes)
-        complete = metadata.model_copy(update={"content_hash": content_hash, "rejections": tuple(rejections)})
-        file.attrs.update(complete.to_attributes())
+        return _complete(file, members, hashes, metadata.model_copy(update={"rejections": tuple(rejections)}))
+
+
+def write_dataset(
+    path: Path, trajectories: Iterable[tuple[str, Trajectory]], task: str, describe: Callable[[], Metadata]
+) -> str:
+    """Write trajectories that come one by one into one dataset file, and return its content hash.
+
+    Args:
+        path: the dataset file to make.
+        trajectories: key and content of each, in the order of the splits.
+        task: in whose splits they are.
+        describe: the root attributes, asked for when the last trajectory has come.
+    """
+    hashes: dict[str, str] = {}
+    members: dict[str, list[str]] = {}
+    with atomic_path(path) as temporary, _hdf5_errors(), h5py.File(temporary, "w", libver=LIBVER) as file:
+        for key, trajectory in trajectories:
+            hashes[key] = _write_trajectory(file, key, trajectory)
+            members.setdefault(f"splits/{task}/{parse_key(key)[0]}", []).append(key)
+        return _complete(file, members, hashes, describe())
+
+
+def _complete(
+    file: h5py.File, members: dict[str, list[str]], hashes: dict[str, str], metadata: Metadata
+) -> str:
+    """Splits and root attributes, which come last; returns the content hash."""
+    for name, keys in members.items():
+        file.create_dataset(name, data=np.array(keys, "S"), chunks=(len(keys),), fletcher32=True)
+    content_hash = combine_hashes(hashes)
+    file.attrs.update(metadata.model_copy(update={"content_hash": content_hash}).to_attributes())
     return content_hash
 
 

@@ -28,6 +28,7 @@ from m3gn_bench.datasets.schema import (
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, reserved, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
+from m3gn_bench.generators.executors import parse_executor
 from m3gn_bench.generators.scene import Scene
 from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.version import __version__
@@ -110,6 +111,7 @@ def generate(
     splits: Sequence[Split] = SPLITS,
     fidelity: Fidelity = "default",
     seed: int = DATASET_SEED,
+    executor: str = "process",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> GenerationReport:
     """Generate a dataset file, or complete one that an earlier run left unfinished.
@@ -118,14 +120,15 @@ def generate(
         scene: which scene, with its options; it is sent to the workers as it is.
         tier: "smoke", "quick" or "paper"; smaller tiers are prefixes of larger ones.
         out: folder for the file and, until it is complete, for its shards.
-        workers: processes.
+        workers: processes; see `run_jobs`.
         splits: which splits to make.
         fidelity: "fast", "default" or "reference".
         seed: of the dataset; leaderboards use the default.
+        executor: what runs the workers; see `run_jobs`. With a cluster, `out` must be a folder that all workers see.
         on_progress: called with (done, total) after every trajectory.
 
     Raises:
-        GeneratorError: unknown names, or a trajectory that cannot be made.
+        GeneratorError: unknown names, a trajectory that cannot be made, or a cluster that cannot be used.
         DatasetError: the folder cannot be written.
     """
     if fidelity not in scene.fidelities:
@@ -134,6 +137,7 @@ def generate(
         raise GeneratorError(f"workers must be at least 1, not {workers}")
     if seed < 0:
         raise GeneratorError(f"the seed must not be negative, as {seed} is")
+    parse_executor(executor)
     sizes = tier_sizes(tier, scene.paper_sizes)
     metadata = _metadata(scene, tier, fidelity, seed)
     path = out / dataset_name(scene, tier, splits, fidelity, seed)
@@ -153,10 +157,11 @@ def generate(
             todo = [key for key in wanted if not _is_complete(shards[key], [key], metadata)]
             done = len(wanted) - len(todo)
             on_progress(done, len(wanted))
-            jobs = ((scene, shards[key], key, *wanted[key], metadata) for key in todo)
-            with closing(
-                run_jobs(_make_shard, jobs, workers)
-            ) as finished:  # so that an exception here ends the workers, too
+            # Workers of a cluster start in folders of their own.
+            jobs = ((scene, shards[key].absolute(), key, *wanted[key], metadata) for key in todo)
+            with closing(  # so that an exception here ends the workers, too
+                run_jobs(_make_shard, jobs, workers, executor=executor, shared=shard_folder)
+            ) as finished:
                 for _ in finished:
                     done += 1
                     on_progress(done, len(wanted))
@@ -224,5 +229,13 @@ _Job = tuple[Scene, Path, str, Split, int, Metadata]
 
 def _make_shard(job: _Job) -> None:
     scene, path, key, split, index, metadata = job
+    if _is_complete(path, [key], metadata):  # a worker that died later had come so far
+        return
+    versions = scene.simulator_versions()
+    if versions != metadata.simulator_versions:
+        raise GeneratorError(
+            f"{platform.node()} would simulate with {versions}, not with {metadata.simulator_versions}; install the same "
+            "on all machines"
+        )
     trajectory, rejected = simulate_one(scene, split, index, seed=metadata.seed, fidelity=metadata.fidelity)
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))

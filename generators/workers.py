@@ -1,34 +1,57 @@
-"""Run independent jobs in several processes that end with this one, however it ends."""
+"""Run independent jobs in several processes: here, where they end with this one however it ends, or on a cluster."""
 
 import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import TypeVar
+from pathlib import Path
 
 from m3gn_bench.generators.errors import GeneratorError
-
-Job = TypeVar("Job")
-Made = TypeVar("Made")
+from m3gn_bench.generators.executors import Job, Made, as_finished, parse_executor
 
 
-def run_jobs(function: Callable[[Job], Made], jobs: Iterable[Job], workers: int) -> Generator[Made]:
+def run_jobs(
+    function: Callable[[Job], Made],
+    jobs: Iterable[Job],
+    workers: int,
+    *,
+    executor: str = "process",
+    shared: Path | None = None,
+) -> Generator[Made]:
     """Results of the function for all jobs, as they finish; a failure or an interrupt stops the rest at once.
 
     Close the generator where it may not be exhausted, so that the workers end, too.
 
     Args:
-        function, jobs: of a module, and what pickle can send, unless there is one worker: that is this process.
-        workers: number of processes.
+        function, jobs: of a module, and what pickle can send, unless one process does it all: that is this one. On a
+            cluster a job is run again if its worker dies, so it must not mind what it did before.
+        workers: number of processes; with "slurm", of jobs at a time; with dask the cluster decides.
+        executor: "process", "dask://HOST:PORT" or "slurm".
+        shared: a folder that all workers of a cluster must see, as everything that jobs read or write.
 
     Raises:
-        GeneratorError: a process died.
+        GeneratorError: unknown executor, no cluster there, a worker that does not fit, or died (on a cluster: again
+            and again).
     """
+    where = parse_executor(executor)
+    if where.kind == "process":
+        return _run_here(function, jobs, workers)
+    from m3gn_bench.generators import clusters
+
+    if shared is None:
+        raise GeneratorError(f"executor {where.kind} needs a folder that all workers see")
+    if where.kind == "dask":
+        return clusters.run_with_dask(function, jobs, where.address, shared)
+    return clusters.run_with_slurm(function, jobs, workers, shared)
+
+
+def _run_here(function: Callable[[Job], Made], jobs: Iterable[Job], workers: int) -> Generator[Made]:
+    """In processes of this machine; one worker is this process."""
     if workers == 1:
         for job in jobs:
             yield function(job)
@@ -36,19 +59,13 @@ def run_jobs(function: Callable[[Job], Made], jobs: Iterable[Job], workers: int)
     context = get_context("spawn")
     end, parent_lives = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(end,))
+
+    def submit(job: Job) -> Future[Made]:
+        with _interrupts_held():
+            return pool.submit(function, job)
+
     try:
-        pending: set[Future[Made]] = set()
-        for job in jobs:
-            with _interrupts_held():
-                pending.add(pool.submit(function, job))
-            if len(pending) >= 2 * workers:
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    yield future.result()
-        while pending:
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
+        yield from as_finished(submit, jobs, lambda: 2 * workers)
         pool.shutdown()  # all done: let workers end by themselves, before the pipe tells them to
     except BrokenProcessPool as error:
         raise GeneratorError(

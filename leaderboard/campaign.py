@@ -213,6 +213,6 @@ def carry_out(job: Job) -> Outcome:
     if run.ships:
         shipped = checkpoint_folder(run.task, run.config.model_name, run.config.preset, run.seed, job.home)
         shutil.rmtree(shipped, ignore_errors=True)
-        shutil.copytree(folder, shipped)
+        shutil.copytree(folder, shipped, ignore=shutil.ignore_patterns(".*"))  # what a killed run left half written
     write_record(record, job.home)
     return Outcome(run, record, None)

@@ -5,13 +5,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.data import Materials, load_cases
 from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, stored_hashes
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.record import HASH_DIGITS, ContextResult, ResultRecord
-from m3gn_bench.tasks import get_task
+from m3gn_bench.tasks import task_of_data
 from m3gn_bench.version import __version__
 
 
@@ -45,8 +45,9 @@ def score(
         CheckpointError, DatasetError: files that are damaged or do not fit.
         BenchError: predictions that are not finite.
     """
-    model, described = load_checkpoint(checkpoint)
-    task = get_task(described.task)
+    with open_file(dataset) as file:
+        task = task_of_data(read_description(checkpoint).task, read_metadata(file))
+    model, described = load_checkpoint(checkpoint, task)
     cases = load_cases(dataset, task, split, tier, materials)
     start = time.perf_counter()
     errors = evaluate_model(model, cases, contexts or task.context_sizes, on_progress)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from m3gn_bench.datasets.errors import unknown_name
-from m3gn_bench.datasets.schema import Record
+from m3gn_bench.datasets.schema import IMPORTED, Record
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
 from m3gn_bench.model import RunConfig, build_model, model_names
 from m3gn_bench.tasks import TASKS
@@ -31,6 +31,8 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         )
     if record.task not in TASKS:
         return Verdict(problems=(unknown_name("task", record.task, list(TASKS)),), remarks=())
+    if record.dataset_version.startswith(IMPORTED):
+        problems.append("it was scored on imported data, but boards are of the benchmark's own")
     if record.split != "test" and record.track != "tuning":
         problems.append(f"split is {record.split!r}, but boards are of the test split")
     contexts = tuple(result.context for result in record.results)

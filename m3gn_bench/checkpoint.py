@@ -17,7 +17,7 @@ from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import CheckpointError
 from m3gn_bench.model import Model, RunConfig, build_model
-from m3gn_bench.tasks import get_task
+from m3gn_bench.tasks import Task, get_task
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "checkpoint.json"
 
@@ -78,8 +78,12 @@ def read_description(folder: Path) -> Checkpoint:
         raise CheckpointError(f"{path} is damaged: {place}: {first['msg']}") from error
 
 
-def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
+def load_checkpoint(folder: Path, task: Task | None = None) -> tuple[Model, Checkpoint]:
     """The model of a checkpoint, ready to predict.
+
+    Args:
+        folder: of the checkpoint.
+        task: its task as the data to predict have it (see `task_of_data`), if not as the benchmark's own have it.
 
     Raises:
         CheckpointError: missing, damaged, or made for another version of the model.
@@ -96,7 +100,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Checkpoint]:
         )
     try:
         config = RunConfig.from_json(description.config.model_dump())
-        model = build_model(config, get_task(description.task))
+        model = build_model(config, task or get_task(description.task))
         model.load_state_dict(load(content))
     except (ValidationError, KeyError, RuntimeError, safetensors.SafetensorError) as error:
         raise CheckpointError(f"{folder} does not fit this version of its model: {error}") from error

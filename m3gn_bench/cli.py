@@ -10,8 +10,11 @@ import click
 from m3gn_bench.console import DATA, JSON, Report, table
 from m3gn_bench.dataset_commands import card, generate, info, reproduce, validate, view
 from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.export_commands import export
+from m3gn_bench.import_commands import import_command
 from m3gn_bench.leaderboard_commands import campaign, leaderboard
 from m3gn_bench.model_commands import evaluate, profile, train
+from m3gn_bench.report_commands import report_command
 from m3gn_bench.study_commands import render_studies, stability, tradeoff
 from m3gn_bench.version import __version__
 
@@ -171,9 +174,9 @@ def doctor(self_test: bool, data: Path, as_json: bool) -> None:
 
 
 for command in (
-    *(generate, validate, info, view, card, reproduce),
+    *(generate, validate, info, view, export, import_command, card, reproduce),
     *(train, evaluate, profile),
     *(tradeoff, stability, render_studies),
-    *(campaign, leaderboard),
+    *(campaign, leaderboard, report_command),
 ):
     cli.add_command(command)

@@ -1,13 +1,17 @@
 """The commands that make, check and show datasets; part of the command line (see `cli`)."""
 
 import sys
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
 
-from m3gn_bench.console import DATA, JSON, WORKERS, Report
+from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, Report
+
+SHIPPED = "compact"  # preset of the checkpoints that are drawn
 
 
 @click.command()
@@ -35,6 +39,7 @@ from m3gn_bench.console import DATA, JSON, WORKERS, Report
     "--seed", type=click.IntRange(min=0), default=None, help="Of the dataset.  [default: the leaderboard's]"
 )
 @WORKERS
+@EXECUTOR
 @DATA
 @JSON
 def generate(
@@ -48,6 +53,7 @@ def generate(
     splits: tuple[str, ...],
     seed: int | None,
     workers: int,
+    executor: str,
     data: Path,
     as_json: bool,
 ) -> None:
@@ -76,6 +82,7 @@ def generate(
             splits=[as_split(split) for split in splits] or SPLITS,
             fidelity=fidelity,  # type: ignore[arg-type]
             seed=DATASET_SEED if seed is None else seed,
+            executor=executor,
             on_progress=on_progress,
         )
     rejected = [rejection.model_dump() for rejection in made.rejected]
@@ -152,19 +159,45 @@ def info(file: Path, as_json: bool) -> None:
     "-o",
     type=click.Path(path_type=Path, dir_okay=False),
     required=True,
-    help="A .png shows frames side by side, a .gif one after the other.",
+    help="A .png shows frames side by side, a .gif or .mp4 one after the other.",
 )
 @click.option(
     "--frames",
     default=None,
-    help="How many, evenly spaced, or a list such as 0,10,20.  [default: 6 in a .png, all in a .gif]",
+    help="How many, evenly spaced, or a list such as 0,10,20.  [default: 6 in a .png (4 with models), else all]",
 )
-@click.option("--fps", type=int, default=20, show_default=True, help="Of a .gif: frames per second.")
+@click.option("--fps", type=int, default=20, show_default=True, help="Of a .gif or .mp4: frames per second.")
 @click.option(
     "--colour",
     default=None,
-    help="What colours show: displacement, height (displacement upwards) or area (over that at rest).  "
-    "[default: depends on the scene]",
+    help="What colours show: displacement, height (displacement upwards), area (over that at rest), or "
+    "distance (of models from the truth).  [default: distance with models, else what suits the scene]",
+)
+@click.option(
+    "--model",
+    "models",
+    multiple=True,
+    help="Draw this model's prediction beside the truth, from the checkpoint that ships with the project "
+    "(may be given several times).",
+)
+@click.option(
+    "--checkpoint",
+    "checkpoints",
+    type=click.Path(path_type=Path, file_okay=False),
+    multiple=True,
+    help="Draw the prediction of a training run in this folder, too (may be given several times).",
+)
+@click.option(
+    "--task",
+    "task_name",
+    default=None,
+    help="What the models were trained on.  [default: the runs' task, else the first of the file's scene]",
+)
+@click.option(
+    "--context",
+    type=int,
+    default=None,
+    help="How many frames the models see.  [default: the middle one of the task's sizes]",
 )
 @JSON
 def view(
@@ -175,12 +208,23 @@ def view(
     frames: str | None,
     fps: int,
     colour: str | None,
+    models: tuple[str, ...],
+    checkpoints: tuple[Path, ...],
+    task_name: str | None,
+    context: int | None,
     as_json: bool,
 ) -> None:
-    """Draw a trajectory of a dataset FILE, with matplotlib; no display is needed."""
+    """Draw a trajectory of a dataset FILE, alone or beside what models predict; no display is needed."""
+    from m3gn_bench.view import Comparison
     from m3gn_bench.view import view as draw
 
     report = Report(as_json)
+    comparison = None
+    if models or checkpoints:
+        task, folders = _checkpoints(file, task_name, models, checkpoints)
+        comparison = Comparison(task, folders, context)
+    elif task_name is not None or context is not None:
+        raise click.UsageError("--task and --context are for models: give --model or --checkpoint, too")
     with report.progress(f"drawing {output.name}") as on_progress:
         viewed = draw(
             file,
@@ -190,12 +234,61 @@ def view(
             frames=frames,
             fps=fps,
             colour=colour,
+            comparison=comparison,
             on_progress=on_progress,
         )
-    report.finish(
-        {"file": str(output), "trajectory": viewed.trajectory, "frames": viewed.frames},
-        f"{output}: {viewed.trajectory}, {len(viewed.frames)} frames",
-    )
+    shown = f"{output}: {viewed.trajectory}, {len(viewed.frames)} frames"
+    if comparison is not None:
+        shown += f" of {', '.join(viewed.panels)}; context {viewed.context}"
+    report.finish({"file": str(output), **asdict(viewed)}, shown)
+
+
+def _checkpoints(
+    file: Path, task_name: str | None, models: Sequence[str], runs: Sequence[Path]
+) -> tuple[str, dict[str, Path]]:
+    """The task of models that are to be drawn, and their folders by title.
+
+    Args:
+        file: the dataset file.
+        task_name: their task, or None for the first run's, or else the first one of the file's scene.
+        models: those whose checkpoints ship with the project.
+        runs: folders of other trained models.
+    """
+    from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.datasets.file import open_file, read_metadata
+    from m3gn_bench.errors import CheckpointError, ConfigError
+    from m3gn_bench.leaderboard.record import checkpoint_folder
+    from m3gn_bench.model import get_model_class, model_names
+    from m3gn_bench.tasks import TASKS, get_task
+
+    described = {run: read_description(run) for run in runs}
+    for name in models:
+        get_model_class(name)
+    if task_name is not None:
+        task = get_task(task_name).name
+    elif described:
+        task = next(iter(described.values())).task
+    else:
+        with open_file(file) as opened:
+            scene = read_metadata(opened).scene
+        found = next((name for name, known in TASKS.items() if known.scene == scene), None)
+        if found is None:
+            raise ConfigError(f"there is no task of scene {scene}, which {file} holds, so no model either")
+        task = found
+
+    folders = {name: checkpoint_folder(task, name, SHIPPED) for name in models}
+    missing = [name for name, folder in folders.items() if not folder.is_dir()]
+    if missing:
+        there = [name for name in model_names() if checkpoint_folder(task, name, SHIPPED).is_dir()]
+        names = ", ".join(there)
+        raise CheckpointError(
+            f"no checkpoint of {missing[0]} on {task} ships with the project"
+            f"{f' (there are {names})' if there else ''}; train one and pass --checkpoint"
+        )
+    for run, description in described.items():
+        name = description.config.model_name
+        folders[f"{name}, {run}" if name in folders else name] = run
+    return task, folders
 
 
 @click.command()

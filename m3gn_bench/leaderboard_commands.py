@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from m3gn_bench.console import DATA, JSON, WORKERS, OnProgress, Report, table
+from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, OnProgress, Report, table
 
 if TYPE_CHECKING:
     from m3gn_bench.leaderboard.record import ResultRecord
@@ -305,11 +305,12 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
     default=os.cpu_count() or 1,
     help="Processes, each of which trains with one thread.  [default: all cores]",
 )
+@EXECUTOR
 @click.option("--status", is_flag=True, help="Only show what is done and what is left.")
 @DATA
 @JSON
 def campaign(
-    plan: Path, home: Path, runs: Path, workers: int, status: bool, data: Path, as_json: bool
+    plan: Path, home: Path, runs: Path, workers: int, executor: str, status: bool, data: Path, as_json: bool
 ) -> None:
     """Train and score all runs of a plan that have no record yet.
 
@@ -317,6 +318,7 @@ def campaign(
     What is interrupted or killed goes on when the same command is run again. Exit code 1 if runs failed.
     """
     from m3gn_bench.datasets.writer import reserved
+    from m3gn_bench.generators.executors import parse_executor
     from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.generators.workers import run_jobs
     from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan
@@ -325,6 +327,7 @@ def campaign(
     from m3gn_bench.tasks import get_task
 
     report = Report(as_json)
+    parse_executor(executor)
     planned = read_plan(plan)
     versions = {run.task: get_scene(get_task(run.task).scene).dataset_version for run in planned}
     records = read_records(home)
@@ -338,12 +341,20 @@ def campaign(
                 task = get_task(name)
                 with report.progress(f"simulating {task.scene}") as on_progress:
                     files[name] = find_or_generate(
-                        task, todo[0].tier, data, workers=workers, on_progress=on_progress
+                        task,
+                        todo[0].tier,
+                        data,
+                        workers=workers,
+                        executor=executor,
+                        on_progress=on_progress,
                     )
-            jobs = (Job(run, files[run.task], runs, home) for run in todo)
+            # Workers of a cluster start in folders of their own.
+            places = runs.absolute(), home.absolute()
+            jobs = (Job(run, files[run.task].absolute(), *places) for run in todo)
+            training = run_jobs(carry_out, jobs, min(workers, len(todo)), executor=executor, shared=runs)
             with (
                 report.progress(f"training {len(todo)} runs") as on_progress,
-                closing(run_jobs(carry_out, jobs, min(workers, len(todo)))) as outcomes,
+                closing(training) as outcomes,
             ):
                 on_progress(0, len(todo))
                 for done, outcome in enumerate(outcomes, 1):

@@ -20,6 +20,12 @@ THREADS = click.option(
     default=os.cpu_count() or 1,
     help="Of torch.  [default: all cores]",
 )
+DATASET = click.option(
+    "--dataset",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=None,
+    help="Use all of this file, whatever --tier and --data say; for imported data, for example.",
+)
 
 
 @click.command()
@@ -41,6 +47,7 @@ THREADS = click.option(
 )
 @click.option("--device", default="cpu", show_default=True, help="A torch device.")
 @click.option("--tensorboard", is_flag=True, help="Write curves to the run's folder.")
+@DATASET
 @WORKERS
 @DATA
 @JSON
@@ -57,6 +64,7 @@ def train(
     threads: int,
     device: str,
     tensorboard: bool,
+    dataset: Path | None,
     workers: int,
     data: Path,
     as_json: bool,
@@ -65,13 +73,15 @@ def train(
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file
     from m3gn_bench.model import build_model, load_preset
-    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import get_task
     from m3gn_bench.training import Progress, require_budget, tensorboard_observer, usable_device
     from m3gn_bench.training import train as train_model
 
     report = Report(as_json)
     spec = get_task(task)
+    if dataset is not None:
+        spec, tier = given(dataset, task)
     overrides = _parse_settings(settings)
     overrides |= {f"training.{k}": v for k, v in (("minutes", minutes), ("steps", steps)) if v is not None}
     config = load_preset(model, preset, spec, overrides)
@@ -79,10 +89,12 @@ def train(
     require_budget(config, build_model(config, spec).is_learned)
     usable_device(device)
     curves = tensorboard_observer(out) if tensorboard else None
-    with report.progress(f"simulating {spec.scene}") as on_progress:
-        path = find_or_generate(
-            spec, tier, data, splits=("train", "validation"), workers=workers, on_progress=on_progress
-        )
+    path = dataset
+    if path is None:
+        with report.progress(f"simulating {spec.scene}") as on_progress:
+            path = find_or_generate(
+                spec, tier, data, splits=("train", "validation"), workers=workers, on_progress=on_progress
+            )
     with open_file(path) as file:
         dataset_hash = content_hash(file, tier, ("train", "validation"))
     training, validation = (load_cases(path, spec, split, tier) for split in ("train", "validation"))
@@ -158,6 +170,7 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     default=None,
     help="Also write a result record below this folder (in a checkout: leaderboard).",
 )
+@DATASET
 @THREADS
 @WORKERS
 @DATA
@@ -173,6 +186,7 @@ def evaluate(
     split: str,
     track: str,
     record_home: Path | None,
+    dataset: Path | None,
     threads: int,
     workers: int,
     data: Path,
@@ -184,12 +198,13 @@ def evaluate(
     """
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.cpu import use_cpu
+    from m3gn_bench.datasets.file import open_file, read_splits
     from m3gn_bench.datasets.schema import as_split
     from m3gn_bench.errors import CheckpointError, ConfigError
     from m3gn_bench.leaderboard.record import checkpoint_folder, find_record, read_records, write_record
     from m3gn_bench.leaderboard.scoring import score
     from m3gn_bench.model import get_model_class, model_names
-    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import TASKS, get_task
 
     report = Report(as_json)
@@ -199,6 +214,8 @@ def evaluate(
     sizes = None if contexts is None else _parse_contexts(contexts)
     if record_home is not None and (part != "test" or sizes is not None):
         raise ConfigError("--record takes the test split at the task's own context sizes")
+    if record_home is not None and dataset is not None:
+        raise ConfigError("--record takes the benchmark's own data, so not --dataset")
     if checkpoint is not None:
         described = read_description(checkpoint)
         if described.config.model_name != model:
@@ -208,6 +225,9 @@ def evaluate(
         folders = {described.task: checkpoint}
     else:
         names = list(TASKS) if task_name is None else [get_task(task_name).name]
+        if dataset is not None and task_name is None:
+            with open_file(dataset) as file:
+                names = list(read_splits(file))
         folders = {name: checkpoint_folder(name, model, preset, seed) for name in names}
         if task_name is None:
             folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
@@ -223,15 +243,19 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     for name, folder in folders.items():
         task = get_task(name)
-        with report.progress(f"simulating {task.scene}") as on_progress:
-            path = find_or_generate(
-                task,
-                tier,
-                data,
-                splits=(part,),
-                workers=workers,
-                on_progress=on_progress,
-            )
+        path = dataset
+        if path is not None:
+            _, tier = given(path, name)
+        else:
+            with report.progress(f"simulating {task.scene}") as on_progress:
+                path = find_or_generate(
+                    task,
+                    tier,
+                    data,
+                    splits=(part,),
+                    workers=workers,
+                    on_progress=on_progress,
+                )
         with report.progress(f"evaluating {name}") as on_progress:
             record = score(
                 folder,
@@ -245,7 +269,8 @@ def evaluate(
             )
         if record_home is not None:
             write_record(record, record_home)
-        reference = find_record(recorded, track, name, record.name)
+        # Trajectories of another file may have the names of the board's.
+        reference = None if dataset else find_record(recorded, track, name, record.name)
         rows += [
             {
                 "task": name,
@@ -265,7 +290,13 @@ def evaluate(
             for r in record.results
         ]
     report.finish(
-        {"model": model, "tier": tier, "split": split, "results": rows},
+        {
+            "model": model,
+            "dataset": None if dataset is None else str(dataset),
+            "tier": tier,
+            "split": split,
+            "results": rows,
+        },
         table(
             f"{model}: full-rollout MSE x 1e6, {split} split",
             [

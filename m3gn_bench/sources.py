@@ -9,10 +9,10 @@ from functools import lru_cache
 from pathlib import Path
 
 from m3gn_bench.data import Case, case_from
-from m3gn_bench.datasets.file import find_dataset
+from m3gn_bench.datasets.file import find_dataset, open_file, read_metadata
 from m3gn_bench.datasets.schema import SPLITS, Split, parse_key
 from m3gn_bench.datasets.trajectory import Trajectory
-from m3gn_bench.tasks import Task
+from m3gn_bench.tasks import Task, task_of_data
 
 
 def find_or_generate(
@@ -22,9 +22,19 @@ def find_or_generate(
     *,
     splits: Sequence[Split] = SPLITS,
     workers: int = 1,
+    executor: str = "process",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
-    """A dataset file in `folder` that holds the task's tier and splits; generated if there is none."""
+    """A dataset file in `folder` that holds the task's tier and splits; generated if there is none.
+
+    Args:
+        task, tier, splits: what it must hold.
+        folder: where to look, and to put it.
+        workers, executor, on_progress: see `generate`.
+
+    Raises:
+        GeneratorError, DatasetError: see `generate`.
+    """
     from m3gn_bench.generators.generate import generate
     from m3gn_bench.generators.scene import get_scene
 
@@ -33,7 +43,22 @@ def find_or_generate(
     if found is not None:
         return found
 
-    return generate(scene, tier, folder, splits=splits, workers=workers, on_progress=on_progress).file
+    return generate(
+        scene,
+        tier,
+        folder,
+        splits=splits,
+        workers=workers,
+        executor=executor,
+        on_progress=on_progress,
+    ).file
+
+
+def given(path: Path, name: str) -> tuple[Task, str]:
+    """A task as a given dataset file has it, and the tier that is all of the file."""
+    with open_file(path) as file:
+        metadata = read_metadata(file)
+    return task_of_data(name, metadata), metadata.tier
 
 
 def regenerate(task: Task, keys: Sequence[str]) -> tuple[list[Case], list[str]]:

@@ -13,11 +13,12 @@ paper leaves a choice.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
+from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import FIXED, Trajectory
 from m3gn_bench.errors import ConfigError
 
@@ -198,3 +199,23 @@ def get_task(name: str) -> Task:
     if name not in TASKS:
         raise ConfigError(unknown_name("task", name, list(TASKS)))
     return TASKS[name]
+
+
+def task_of_data(name: str, metadata: Metadata) -> Task:
+    """The task as a dataset has it: data of others have a length of their own, and may not tell the material.
+
+    Raises:
+        ConfigError: no such task.
+        DatasetError: too few frames for the contexts that models are trained on and scored at.
+    """
+    task = get_task(name)
+    if not metadata.is_imported:
+        return task
+    longest = max(*task.context_sizes, *task.training_context)
+    if metadata.frames <= longest:
+        raise DatasetError(
+            f"{metadata.frames} frames are too few for task {name}, whose models see up to {longest} of them and "
+            "predict the rest"
+        )
+    told = tuple(feature for feature in task.material if feature.name in metadata.material_units)
+    return replace(task, frames=metadata.frames, material=told)

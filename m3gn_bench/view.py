@@ -1,6 +1,8 @@
-"""Draw a trajectory of a dataset file: a still with several frames, or an animation. No display is needed."""
+"""Draw a trajectory of a dataset file, alone or beside what models predict: a still with several frames, or an
+animation. No display is needed.
+"""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -8,17 +10,18 @@ from typing import Literal, get_args
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
-from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory, stored_hashes
-from m3gn_bench.datasets.schema import as_split, parse_key, trajectory_key
+from m3gn_bench.datasets.file import find_key, open_file, read_metadata, read_trajectory
 from m3gn_bench.datasets.trajectory import CELL_CORNERS, Trajectory
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
+from m3gn_bench.tasks import task_of_data
 
-# What the colours can show: how far a node is from where it was in frame 0, how much of that is upwards, or
-# how many times its area at rest a triangle covers.
-Colour = Literal["displacement", "height", "area"]
+# What the colours can show: how far a node is from where it was in frame 0, how much of that is upwards,
+# how many times its area at rest a triangle covers, or how far a prediction is from the truth.
+Colour = Literal["displacement", "height", "area", "distance"]
 COLOURS: tuple[Colour, ...] = get_args(Colour)
-STILL_FRAMES = 6
+KINDS = {".png": "a still", ".gif": "an animation", ".mp4": "an animation"}
+STILL_FRAMES, COMPARED_FRAMES = 6, 4  # in a .png, unless the user says otherwise
 MAX_FPS = 50  # a GIF counts in hundredths of a second, and viewers slow down anything below two of them
 
 
@@ -51,11 +54,35 @@ LOOKS = {
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """Models to draw beside the truth.
+
+    Attributes:
+        task: what they were trained on.
+        checkpoints: their folders, by the title of their panels.
+        context: the number of frames that they are given; None for the middle one of the task's sizes.
+    """
+
+    task: str
+    checkpoints: Mapping[str, Path]
+    context: int | None = None
+
+
+@dataclass(frozen=True)
 class Viewed:
-    """What was drawn: the trajectory's key and the frames."""
+    """What was drawn.
+
+    Attributes:
+        trajectory: its key.
+        frames: the frames.
+        panels: the truth and models; of each frame one panel each.
+        context: the number of frames that the models were given, if there are models.
+    """
 
     trajectory: str
     frames: list[int]
+    panels: list[str]
+    context: int | None
 
 
 def view(
@@ -67,67 +94,87 @@ def view(
     frames: str | None = None,
     fps: int = 20,
     colour: str | None = None,
+    comparison: Comparison | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Viewed:
     """Draw frames of one trajectory of a dataset file.
 
     Args:
         file: the dataset file.
-        out: the picture; a .png shows the frames side by side, a .gif one after the other.
+        out: the picture; a .png shows the frames side by side, a .gif or .mp4 one after the other.
         split, index: which trajectory.
         frames: a number of evenly spaced frames, or a list such as "0,10,20"; None for 6 of them in a .png
-            and all in a .gif.
-        fps: frames per second of a .gif.
-        colour: one of `COLOURS`, or None for the scene's own.
+            (4 where there are models) and all in an animation.
+        fps: frames per second of an animation.
+        colour: one of `COLOURS`, or None for the scene's own, or the distance where there are models.
+        comparison: models whose predictions are drawn beside the truth, if any.
         on_progress: called with the number of frames done and of all.
 
     Raises:
         DatasetError: the file is unusable, or has no such trajectory; or `out` cannot be written.
-        ConfigError: the ending of `out`, frames, fps or colour make no sense, or matplotlib is missing.
+        ConfigError: the ending of `out`, frames, fps, colour, task or context make no sense, or matplotlib
+            or, for an .mp4, PyAV is missing.
+        CheckpointError: a model's checkpoint is unusable, or of another task.
+        BenchError: a prediction diverges.
     """
     kind = out.suffix.lower()
-    if kind not in (".png", ".gif"):
-        raise ConfigError(f"{out} must end in .png (a still) or in .gif (an animation)")
+    if kind not in KINDS:
+        endings = [f"{ending} ({what})" for ending, what in KINDS.items()]
+        raise ConfigError(f"{out} must end in {', '.join(endings[:-1])} or {endings[-1]}")
     if not 1 <= fps <= MAX_FPS:
         raise ConfigError(f"{fps} frames per second are out of range: 1 to {MAX_FPS}")
     if colour is not None and colour not in COLOURS:
         raise ConfigError(unknown_name("colour", colour, list(COLOURS)))
+    if colour == "distance" and comparison is None:
+        raise ConfigError("colour 'distance' is that of models from the truth: name a model or a checkpoint")
     try:
+        from m3gn_bench.movie import require_mp4
         from m3gn_bench.picture import Picture
     except ImportError as error:
         raise ConfigError(
             f"pictures need matplotlib and pillow ({error}); pip install 'm3gn-bench[plot]'"
         ) from error
 
+    if kind == ".mp4":
+        require_mp4()
+
     with open_file(file) as opened:
         metadata = read_metadata(opened)
-        key = _find(file, list(stored_hashes(opened)), split, index)
+        key = find_key(opened, split, index)
         trajectory = read_trajectory(opened, key)
     _require_drawable(trajectory, f"{file}: trajectory {key}")
     count = len(trajectory.positions)
-    chosen = select_frames(frames, count, STILL_FRAMES if kind == ".png" else count)
+    few = COMPARED_FRAMES if comparison else STILL_FRAMES
+    chosen = select_frames(frames, count, few if kind == ".png" else count)
     look = LOOKS.get(metadata.scene, Look())
+    context, predictions = None, {}
+    if comparison is not None:
+        from m3gn_bench.predictions import predict  # needs torch
+
+        task = task_of_data(comparison.task, metadata)
+        if task.scene != metadata.scene:
+            raise ConfigError(f"task {task.name} is of scene {task.scene}, but {file} holds {metadata.scene}")
+        middle = task.context_sizes[len(task.context_sizes) // 2]
+        context = middle if comparison.context is None else comparison.context
+        predictions = predict(comparison.checkpoints, task, context, trajectory, key, metadata)
     picture = Picture(
-        trajectory, metadata, look, colour or look.colour, f"{metadata.scene}, {split} trajectory {index}"
+        trajectory,
+        metadata,
+        look,
+        colour or ("distance" if predictions else look.colour),
+        f"{comparison.task if comparison else metadata.scene}, {split} trajectory {index}",
+        predictions=predictions,
+        context=context or 0,
     )
-    content = picture.still(chosen) if kind == ".png" else picture.animation(chosen, fps, on_progress)
+    match kind:
+        case ".png":
+            content = picture.still(chosen)
+        case ".gif":
+            content = picture.gif(chosen, fps, on_progress)
+        case _:
+            content = picture.mp4(chosen, fps, on_progress)
     write_bytes_atomically(out, content)
-    return Viewed(trajectory=key, frames=chosen)
-
-
-def _find(file: Path, keys: list[str], split: str, index: int) -> str:
-    """The key of a trajectory. Raises DatasetError with what there is instead."""
-    wanted = as_split(split)
-    count = sum(parse_key(key)[0] == wanted for key in keys)
-    if not count:
-        present = sorted({parse_key(key)[0] for key in keys})
-        raise DatasetError(f"{file} has no {split} trajectories; it has {' and '.join(present) or 'none'}")
-    key = trajectory_key(split, index)
-    if key not in keys:
-        raise DatasetError(
-            f"index {index} is out of range: {file} has {count} {split} trajectories, 0 to {count - 1}"
-        )
-    return key
+    return Viewed(trajectory=key, frames=chosen, panels=picture.names, context=context)
 
 
 def _require_drawable(trajectory: Trajectory, where: str) -> None:

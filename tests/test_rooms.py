@@ -22,7 +22,7 @@ ALLOWED = {
     "leaderboard": {"leaderboard", "m3gn_bench", "version", "datasets"},
 }
 # These reach further, but only inside functions: a model can be evaluated without a simulator installed.
-COMMANDS = ("dataset_commands", "leaderboard_commands", "model_commands", "study_commands")
+COMMANDS = ("dataset_commands", "leaderboard_commands", "model_commands", "report_commands", "study_commands")
 LAZY = {f"m3gn_bench/{name}.py" for name in ("cli", *COMMANDS, "doctor", "sources", "stability", "tradeoff")}
 LAZILY_ALLOWED = {"generators", "leaderboard", "baselines"}
 

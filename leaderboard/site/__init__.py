@@ -1,0 +1,1 @@
+"""The records as a web site of plain files, which needs no server: pages, figures, and rollouts to look at."""

@@ -1,0 +1,326 @@
+"""Clusters make what one machine makes, whatever dies on the way; whatever is wrong with them is one clear line."""
+
+import importlib.util
+import json
+import logging
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import executor_jobs
+import pytest
+
+from m3gn_bench.cli import run
+from m3gn_bench.datasets.file import content_hash, open_file
+from m3gn_bench.generators import clusters
+from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.executors import Executor, parse_executor
+from m3gn_bench.generators.generate import generate
+from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.generators.workers import run_jobs
+
+DASK = Path(sys.executable).parent / "dask"
+HERE = Path(__file__).parent
+LOSSES = 1  # of a job, after which the scheduler of these tests gives it up
+
+
+# --- names ------------------------------------------------------------------------------------------------
+
+
+def test_known_executors() -> None:
+    assert parse_executor("process") == Executor("process")
+    assert parse_executor("slurm") == Executor("slurm")
+    assert parse_executor("dask://head-node:8786") == Executor("dask", "head-node:8786")
+    assert parse_executor("dask://[::1]:8786") == Executor("dask", "[::1]:8786")
+
+
+@pytest.mark.parametrize("text", ["", "ray", "dask", "dask://head", "dask://head:x", "dask://:8786", "Slurm"])
+def test_unknown_executors_list_what_exists(text: str) -> None:
+    with pytest.raises(GeneratorError, match=r"unknown executor .*; known: dask://HOST:PORT, process, slurm"):
+        parse_executor(text)
+
+
+@pytest.mark.parametrize(("text", "extra"), [("dask://head:1", "dask"), ("slurm", "slurm")])
+def test_a_missing_library_names_the_extra(text: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda library: None)
+    with pytest.raises(GeneratorError, match=rf"pip install 'm3gn-bench\[{extra}\]'"):
+        parse_executor(text)
+
+
+@pytest.mark.parametrize(
+    ("executor", "message"),
+    [
+        ("ray", "unknown executor 'ray'"),
+        ("dask://127.0.0.1:1", "no dask scheduler answers at 127.0.0.1:1"),
+        ("slurm", "there is no SLURM on this machine"),
+    ],
+)
+def test_the_command_says_what_is_wrong(
+    executor: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    start = time.monotonic()
+    with pytest.raises(SystemExit) as stop:
+        run(["generate", "sheet_deformation", "--tier", "smoke", "--out", str(tmp_path), "--executor", executor])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {'' if executor != 'slurm' else 'executor slurm: '}{message}")
+    assert time.monotonic() - start < 15  # a few seconds, on a machine that has nothing else to do
+
+
+# --- dask -------------------------------------------------------------------------------------------------
+
+
+class Cluster:
+    """A dask scheduler and its workers, in processes of their own, which start in a folder of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / "scheduler.json"
+        self.scheduler = self._start("scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard")
+        self.workers: list[subprocess.Popen[bytes]] = []
+        deadline = time.monotonic() + 60
+        while not self.file.exists():
+            assert time.monotonic() < deadline
+            assert self.scheduler.poll() is None
+            time.sleep(0.05)
+        self.executor = json.loads(self.file.read_text())["address"].replace("tcp://", "dask://")
+
+    def add_worker(self, threads: int = 1) -> None:
+        self.workers.append(self._start("worker", "--nthreads", str(threads), "--no-nanny", "--no-dashboard"))
+
+    def stop(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+
+    def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
+        with (self.folder / f"{kind}.log").open("ab") as log:
+            return subprocess.Popen(
+                [str(DASK), kind, "--scheduler-file", str(self.file), *options],
+                cwd=self.folder,
+                stdout=log,
+                stderr=log,
+            )
+
+
+@pytest.fixture
+def cluster(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Cluster]:
+    """A scheduler without workers."""
+    monkeypatch.setenv("PYTHONPATH", str(HERE))
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", str(LOSSES))
+    started = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield started
+    started.stop()
+
+
+def test_a_killed_worker_of_dask_loses_nothing(
+    cluster: Cluster, smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What one worker had in hand the other makes; the same data as in one process. The folder is a relative one."""
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        cluster.add_worker()
+
+    def kill_a_worker(done: int, total: int) -> None:
+        if done == 3:
+            cluster.workers[0].kill()
+
+    scene = get_scene("sheet_deformation")
+    made = generate(scene, "smoke", Path("data"), executor=cluster.executor, on_progress=kill_a_worker)
+    with open_file(smoke_file) as file:
+        assert made.content_hash == content_hash(file)
+    assert made.generated == 16
+    assert [worker.poll() is None for worker in cluster.workers] == [False, True]
+    assert {path.name for path in (tmp_path / "data").iterdir()} == {smoke_file.name}
+
+
+def test_a_campaign_on_dask(
+    cluster: Cluster, smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster.add_worker()
+    plan = tmp_path / "plan.toml"
+    plan.write_text(
+        'track = "trial"\ntier = "smoke"\n[[runs]]\ntasks = ["sheet_deformation"]\nmodels = ["mgn"]\n'
+        'preset = "smoke"\nsteps = 3\nseeds = [0, 1]\n'
+    )
+    places = [f"--{name}={tmp_path / name}" for name in ("home", "runs")]
+    with pytest.raises(SystemExit) as stop:
+        run(
+            ["campaign", str(plan), *places, f"--data={smoke_file.parent}", "--executor", cluster.executor]
+            + ["--json"]
+        )
+    assert (stop.value.code or 0) == 0
+    assert json.loads(capsys.readouterr().out)["counts"] == {"done": 2, "outdated": 0, "to do": 0}
+
+
+def test_workers_of_dask_that_do_not_fit(cluster: Cluster, tmp_path: Path) -> None:
+    """Jobs in threads of one process would share random generators; a folder that is not shared holds no results."""
+    jobs = [tmp_path / "a"]
+    cluster.add_worker(threads=2)
+    with pytest.raises(GeneratorError, match=r"2 jobs at a time in one process.*--nthreads 1"):
+        list(run_jobs(executor_jobs.name, jobs, 1, executor=cluster.executor, shared=tmp_path))
+    cluster.workers[0].kill()
+    cluster.add_worker()
+    with pytest.raises(GeneratorError, match=r"does not see .*elsewhere; .*file system"):
+        list(run_jobs(executor_jobs.name, jobs, 1, executor=cluster.executor, shared=tmp_path / "elsewhere"))
+    with pytest.raises(GeneratorError, match="a cannot be made"):
+        list(run_jobs(executor_jobs.fail, jobs, 1, executor=cluster.executor, shared=tmp_path))
+
+
+def test_a_job_that_kills_its_workers_ends(cluster: Cluster, tmp_path: Path) -> None:
+    for _ in range(LOSSES + 1):
+        cluster.add_worker()
+    with pytest.raises(GeneratorError, match=r"2 workers died of the same job, .*out of memory"):
+        list(run_jobs(executor_jobs.die, [tmp_path], 1, executor=cluster.executor, shared=tmp_path))
+
+
+def test_a_scheduler_without_workers_and_then_gone(
+    cluster: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Jobs wait for workers, and say so; when the scheduler goes, they end."""
+    jobs = [tmp_path / str(number) for number in range(20)]
+    results = run_jobs(executor_jobs.slow_name, jobs, 1, executor=cluster.executor, shared=tmp_path)
+    made = []
+    with closing(results), pytest.raises(GeneratorError, match=r"scheduler .* went away; run the same"):
+        with caplog.at_level(logging.WARNING, logger=clusters.__name__):
+            # The first look at workers is before the first result, which needs one.
+            cluster.add_worker()
+            made.append(next(results))
+        cluster.scheduler.kill()
+        made += results
+    assert "the dask scheduler has no workers" in caplog.text
+    assert 0 < len(made) < 20
+
+
+# --- SLURM ------------------------------------------------------------------------------------------------
+
+
+def test_jobs_of_slurm_make_the_same_data(
+    smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By submitit's stand-in for SLURM, which runs jobs here."""
+    monkeypatch.setattr(clusters, "SLURM_CLUSTER", "local")
+    scene = get_scene("sheet_deformation")
+    done = []
+    made = generate(
+        scene,
+        "smoke",
+        tmp_path,
+        splits=["test"],
+        executor="slurm",
+        on_progress=lambda count, total: done.append(count),
+    )
+    with open_file(smoke_file) as file:
+        assert made.content_hash == content_hash(file, "smoke", ["test"])
+    assert done == [0, 1, 2, 3, 4]
+    assert {path.name for path in tmp_path.iterdir()} == {made.file.name}
+
+
+# Commands of SLURM, as far as submitit uses them: jobs run here at once, and their states are files.
+SBATCH = """
+number = sum(1 for _ in STATES.glob("*.sh")) + 1
+script = STATES / f"{number}.sh"
+script.write_text(Path(sys.argv[1]).read_text())
+array = re.search(r"--array=0-([0-9]+)%([0-9]+)", script.read_text())
+for task in range(int(array[1]) + 1) if array else [None]:
+    name = str(number) if task is None else f"{number}_{task}"
+    known = {"SLURM_JOB_ID": str(number), "STATE": str(STATES / f"{name}.state")}
+    if task is not None:
+        known |= {"SLURM_ARRAY_JOB_ID": str(number), "SLURM_ARRAY_TASK_ID": str(task)}
+    Path(known["STATE"]).write_text("RUNNING")
+    subprocess.Popen(["bash", script], env=os.environ | known, stdout=subprocess.DEVNULL)
+print(f"Submitted batch job {number}")
+"""
+SRUN = """
+command = sys.argv[sys.argv.index(sys.executable) :]
+code = subprocess.run(command, capture_output=True).returncode
+Path(os.environ["STATE"]).write_text("FAILED" if code else "COMPLETED")
+"""
+SACCT = """
+print("JobID|State|NodeList")
+for path in STATES.glob("*.state"):
+    print(f"{path.stem}|{path.read_text()}|here")
+"""
+SCANCEL = """
+(STATES / f"{sys.argv[1]}.cancelled").touch()
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the scripts, states and cancelled jobs of a made-up SLURM."""
+    commands, states = tmp_path / "commands", tmp_path / "states"
+    commands.mkdir()
+    states.mkdir()
+    head = "import os, re, subprocess, sys\nfrom pathlib import Path\n"
+    for name, body in {"sbatch": SBATCH, "srun": SRUN, "sacct": SACCT, "scancel": SCANCEL}.items():
+        script = commands / name
+        script.write_text(f"#!{sys.executable}\n{head}STATES = Path({str(states)!r})\n{body}")
+        script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(commands), prepend=":")
+    monkeypatch.setenv("PYTHONPATH", str(HERE))
+    monkeypatch.setattr(clusters, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr("submitit.core.core.Job._results_timeout_s", 1)
+    return states
+
+
+def on_slurm(function: Callable[[Path], str], jobs: list[Path], shared: Path, workers: int = 1) -> set[str]:
+    return set(run_jobs(function, jobs, workers, executor="slurm", shared=shared))
+
+
+def test_slurm_gets_one_array_of_jobs(slurm: Path, tmp_path: Path) -> None:
+    jobs = [Path(str(number)) for number in range(10)]
+    assert on_slurm(executor_jobs.name, jobs, tmp_path) == {job.name for job in jobs}
+    (script,) = slurm.glob("*.sh")
+    assert f"#SBATCH --array=0-{clusters.PARTS_PER_WORKER - 1}%1\n" in script.read_text()
+    assert list(slurm.glob("*.cancelled")) == []
+    assert not (tmp_path / "slurm").exists()
+
+
+def test_a_lost_job_of_slurm_is_submitted_again(slurm: Path, tmp_path: Path) -> None:
+    jobs = [tmp_path / name for name in ("lost", "also lost")]
+    jobs[1].touch()  # not this time
+    assert on_slurm(executor_jobs.die_once, jobs, tmp_path) == {"lost", "also lost"}
+    assert len(list(slurm.glob("*.sh"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("function", "message", "submitted"),
+    [
+        (executor_jobs.die, "was lost", clusters.LOSSES),
+        (executor_jobs.fail, "a cannot be made", 1),
+        (executor_jobs.break_down, r"failed; its log is .*out", 1),
+    ],
+)
+def test_jobs_of_slurm_that_cannot_be_done(
+    slurm: Path, tmp_path: Path, function: Callable[[Path], str], message: str, submitted: int
+) -> None:
+    with pytest.raises(GeneratorError, match=message):
+        on_slurm(function, [tmp_path / "a"], tmp_path)
+    assert len(list(slurm.glob("*.sh"))) == submitted
+
+
+def test_an_interrupt_cancels_what_slurm_still_has(slurm: Path, tmp_path: Path) -> None:
+    jobs = [tmp_path / str(number) for number in range(12)]
+    with closing(
+        run_jobs(executor_jobs.slow_name, jobs, 1, executor="slurm", shared=tmp_path)
+    ) as results:
+        next(results)
+    assert len(list(slurm.glob("*.cancelled"))) == clusters.PARTS_PER_WORKER - 1
+
+
+def test_slurm_that_refuses(slurm: Path, tmp_path: Path) -> None:
+    refusing = tmp_path / "commands" / "sbatch"
+    refusing.write_text("#!/bin/sh\necho 'sbatch: error: invalid partition' >&2\nexit 1\n")
+    with pytest.raises(GeneratorError, match="SLURM does not take the jobs: .*invalid partition"):
+        on_slurm(executor_jobs.name, [tmp_path / "a"], tmp_path)
