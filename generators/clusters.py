@@ -25,11 +25,14 @@ if TYPE_CHECKING:
 
 CONNECT_SECONDS = 4  # to a scheduler
 LOOK_SECONDS = 10.0  # between looks at workers that give no results
+GONE = "the dask scheduler at {} went away; run the same command again to go on"
 
 SLURM_CLUSTER = "slurm"  # submitit's name of it
 PARTS_PER_WORKER = 4  # of all jobs: more even out, fewer start Python less often
 LARGEST_ARRAY = 1000  # jobs at once that SLURM takes where nobody changed MaxArraySize
-SLURM_MINUTES = 240  # before SLURM stops a job and it is queued again; SBATCH_TIMELIMIT in the environment wins
+SLURM_MINUTES = (
+    240  # before SLURM stops a job and it is queued again; SBATCH_TIMELIMIT in the environment wins
+)
 LOSSES = 3  # of the same part, before it is given up; dask has the same limit
 POLL_SECONDS = 1.0
 
@@ -83,18 +86,18 @@ def run_with_dask(
     pool = client.get_executor(pure=False)  # the same job again is to be done again
     submit = partial(pool.submit, partial(_in_own_process, _OnWorker(function, shared.absolute())))
     try:
-        yield from as_finished(submit, jobs, _Workers(client).window, LOOK_SECONDS)
+        yield from as_finished(submit, jobs, _Workers(client, address).window, LOOK_SECONDS)
     except KilledWorker as error:
         raise GeneratorError(
             f"{error.allowed_failures + 1} workers died of the same job, the last one at {error.last_worker.address} "
             "(out of memory?); run the same command again to go on"
         ) from error
-    except (CancelledError, OSError) as error:
-        raise GeneratorError(
-            f"the dask scheduler at {address} went away; run the same command again to go on"
-        ) from error
+    except CancelledError as error:
+        raise GeneratorError(GONE.format(address)) from error
     except ModuleNotFoundError as error:
-        raise GeneratorError(f"a worker has no module {error.name}; install the same there as here") from error
+        raise GeneratorError(
+            f"a worker has no module {error.name}; install the same there as here"
+        ) from error
     finally:
         pool.shutdown(wait=False)
         client.close()
@@ -118,11 +121,15 @@ class _Workers:
     """Those of a scheduler, which may come and go."""
 
     client: "Client"
+    address: str
     present: bool = True
 
     def window(self) -> int:
         """Twice as many jobs as there are workers, so that none waits; says so once where there are none."""
-        count = len(self.client.nthreads())
+        try:
+            count = len(self.client.nthreads())
+        except OSError as error:
+            raise GeneratorError(GONE.format(self.address)) from error
         if self.present and not count:
             logging.getLogger(__name__).warning("the dask scheduler has no workers; waiting for some")
         self.present = count > 0

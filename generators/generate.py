@@ -234,8 +234,8 @@ def _make_shard(job: _Job) -> None:
     versions = scene.simulator_versions()
     if versions != metadata.simulator_versions:
         raise GeneratorError(
-            f"{platform.node()} would simulate with {versions}, not with {metadata.simulator_versions}; install the same "
-            "on all machines"
+            f"{platform.node()} would simulate with {versions}, not with {metadata.simulator_versions}; install the "
+            "same on all machines"
         )
     trajectory, rejected = simulate_one(scene, split, index, seed=metadata.seed, fidelity=metadata.fidelity)
     write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))

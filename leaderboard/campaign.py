@@ -213,6 +213,7 @@ def carry_out(job: Job) -> Outcome:
     if run.ships:
         shipped = checkpoint_folder(run.task, run.config.model_name, run.config.preset, run.seed, job.home)
         shutil.rmtree(shipped, ignore_errors=True)
-        shutil.copytree(folder, shipped, ignore=shutil.ignore_patterns(".*"))  # what a killed run left half written
+        half_written = shutil.ignore_patterns(".*")  # left by a process that was killed
+        shutil.copytree(folder, shipped, ignore=half_written)
     write_record(record, job.home)
     return Outcome(run, record, None)

@@ -42,8 +42,8 @@ EXECUTOR = click.option(
     default="process",
     show_default=True,
     metavar="process|dask://HOST:PORT|slurm",
-    help="What runs them: this machine, the workers of a dask scheduler (extra `dask`), or SLURM (extra `slurm`), where "
-    "--workers counts jobs at a time. On a cluster all folders must be on a file system that all workers see.",
+    help="What runs them: this machine, the workers of a dask scheduler (extra `dask`), or SLURM (extra `slurm`), "
+    "where --workers counts jobs at a time. On a cluster all folders must be on a file system that all workers see.",
 )
 OnProgress = Callable[[int, int], None]
 

@@ -1,8 +1,13 @@
-"""Images one after the other, as one file: .gif with Pillow, .mp4 with PyAV (extra `movie`)."""
+"""Images one after the other, as one file: .gif with Pillow, .mp4 with the program ffmpeg."""
 
 import io
+import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import chain
+from pathlib import Path
+from subprocess import PIPE, Popen
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,41 +36,51 @@ def gif(images: Iterator[Pixels], samples: Sequence[Pixels], fps: int) -> bytes:
     return buffer.getvalue()
 
 
-def require_mp4() -> None:
-    """Raise ConfigError unless there is a library that writes .mp4."""
-    try:
-        import av  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(f"an .mp4 needs PyAV ({error}); pip install 'm3gn-bench[movie]'") from error
+def require_mp4() -> str:
+    """The program that writes .mp4. Raises ConfigError if it is not installed."""
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise ConfigError("an .mp4 needs the program ffmpeg (e.g. apt install ffmpeg, brew install ffmpeg)")
+    return program
 
 
 def mp4(images: Iterator[Pixels], fps: int) -> bytes:
     """An MP4 in H.264, in the form that every browser plays.
+
+    A program of its own: encoders of this kind come under licences that a dependency of ours may not have.
 
     Args:
         images: at least one, each of shape [rows, columns, 3].
         fps: frames per second.
 
     Raises:
-        ConfigError: PyAV is missing.
+        ConfigError: ffmpeg is missing, or refuses.
     """
-    require_mp4()
-    import av
-
+    program = require_mp4()
     first = next(images)
     rows, columns, _ = first.shape
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{columns}x{rows}", "-r", str(fps), "-i", "-"]
     # This form halves the resolution of colours, so it takes even sizes only.
-    margins = ((0, rows % 2), (0, columns % 2), (0, 0))
-    buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("h264", rate=fps, options={"crf": QUALITY})
-        stream.height, stream.width = rows + rows % 2, columns + columns % 2
-        stream.pix_fmt = "yuv420p"
-        for image in chain([first], images):
-            frame = av.VideoFrame.from_ndarray(np.pad(image, margins, mode="edge"), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return buffer.getvalue()
+    form = [
+        "-vf",
+        "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white",
+        "-pix_fmt",
+        "yuv420p",
+        "-movflags",
+        "+faststart",
+    ]
+    with TemporaryDirectory() as folder:
+        path, messages = Path(folder) / "movie.mp4", Path(folder) / "messages"
+        command = [program, "-loglevel", "error", *raw, *form, "-crf", QUALITY, str(path)]
+        with messages.open("wb") as errors, Popen(command, stdin=PIPE, stderr=errors) as process:
+            assert process.stdin is not None
+            with suppress(BrokenPipeError):  # it has ended, and says why
+                for image in chain([first], images):
+                    process.stdin.write(np.ascontiguousarray(image).tobytes())
+                process.stdin.close()
+        if process.returncode:
+            raise ConfigError(f"ffmpeg could not write the .mp4: {messages.read_text(errors='replace')}")
+        return path.read_bytes()
 
 
 def _palette(pixels: Pixels) -> Image.Image:

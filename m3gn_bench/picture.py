@@ -45,7 +45,8 @@ MARGIN = 0.05  # around the motion, of its larger extent
 NARROWEST = 0.52  # width over height of one panel: its title must fit
 BEYOND = 0.25  # how far a prediction may widen the picture, of the truth's larger extent
 PALETTE_FRAMES = 8
-TITLE_SIZE, LETTER = 9.0, 0.55  # of a panel's title [pt]; width of a letter over its size
+TITLE_SIZE = 9.0  # of a panel's title [pt], unless the panel is too narrow for it
+LETTER = {"normal": 0.55, "bold": 0.68}  # width of a letter over its size
 
 LIGHT = np.array([-0.45, 0.5, 0.74])  # right, up, towards the camera; of length 1
 AMBIENT = 0.6
@@ -307,6 +308,7 @@ class Picture:
     def _draw_title(self, panel: Axes, motion: int, frame: int) -> None:
         width = 72 * panel.bbox.width / panel.figure.dpi  # points
         for number, line in enumerate(reversed(self.title(motion, frame))):
+            weight = "bold" if number else "normal"
             panel.annotate(
                 line,
                 (0.5, 1),
@@ -314,8 +316,8 @@ class Picture:
                 xycoords="axes fraction",
                 textcoords="offset points",
                 ha="center",
-                fontsize=min(TITLE_SIZE, width / (LETTER * len(line))),
-                fontweight="bold" if number else "normal",
+                fontsize=min(TITLE_SIZE, width / (LETTER[weight] * len(line))),
+                fontweight=weight,
             )
 
     def _draw_shadow(self, panel: Axes, motion: int, frame: int) -> None:

@@ -69,12 +69,13 @@ def report_command(
     report = Report(as_json)
     home = home or HOME
     records = read_records(home)
-    found = read_studies(studies or STUDIES)
+    tradeoffs, stabilities = read_studies(studies or STUDIES)
+    studied = len(tradeoffs) + len(stabilities)
     rollouts, left_out = (
         _rollouts(report, records, home, tier, data, workers) if with_rollouts else (None, [])
     )
     with report.progress("making pages") as on_progress:
-        files = build(output, records, found, rollouts, on_progress)
+        files = build(output, records, (tradeoffs, stabilities), rollouts, on_progress)
     size = sum(path.stat().st_size for path in files)
     shown = [] if rollouts is None else rollouts
     notes = [*left_out, *(note for one in shown for note in one.notes)]
@@ -84,7 +85,7 @@ def report_command(
             "files": [str(path) for path in files],
             "bytes": size,
             "records": len(records),
-            "studies": sum(map(len, found)),
+            "studies": studied,
             "rollouts": {
                 one.task.name: {"models": one.models, "trajectories": [script.name for script in one.scripts]}
                 for one in shown
@@ -93,7 +94,7 @@ def report_command(
         },
         *(f"note: {note}" for note in notes),
         f"{output / 'index.html'}: {len(files)} files, {size / 1e6:.1f} MB, of {len(records)} records and "
-        f"{sum(map(len, found))} studies; rollouts of {len(shown)} tasks",
+        f"{studied} studies; rollouts of {len(shown)} tasks",
     )
 
 

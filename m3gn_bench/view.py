@@ -113,7 +113,7 @@ def view(
     Raises:
         DatasetError: the file is unusable, or has no such trajectory; or `out` cannot be written.
         ConfigError: the ending of `out`, frames, fps, colour, task or context make no sense, or matplotlib
-            or, for an .mp4, PyAV is missing.
+            or, for an .mp4, ffmpeg is missing.
         CheckpointError: a model's checkpoint is unusable, or of another task.
         BenchError: a prediction diverges.
     """

@@ -167,7 +167,7 @@ def pack(values: np.ndarray, step: float) -> str:
 
 def _scene(case: Case, trajectory: Trajectory, metadata: Metadata) -> dict[str, Any]:
     """Everything but the predictions, for `static/rollouts.js`; positions in scaled units, always three coordinates."""
-    from m3gn_bench.picture import surface
+    from m3gn_bench.picture_geometry import surface
 
     frames = kept_frames(case.frames)
     truth, path = _in_space(case.positions[frames]), _in_space(case.collider_path[frames])
