@@ -192,7 +192,11 @@ class BayesianEncoder(ContextEncoder):
         mean, variance = bayesian_aggregation(observations, variances, pair_weights(pairs))
         if rng is None:
             return mean
-        drawn = rng.standard_normal(mean.shape, dtype=np.float32)
+
+        def draw(count: int) -> np.ndarray:
+            return rng.standard_normal((count, mean.shape[1]), dtype=np.float32)
+
+        drawn = np.concatenate([body.drawn_per_node(draw), body.drawn_per_collider_node(draw)])
         return mean + variance.sqrt() * torch.from_numpy(drawn).to(mean.device)
 
 
@@ -272,9 +276,12 @@ class M3GNStep(Model):
         lower, upper = self.task.training_context
         context = case.context(int(rng.integers(lower, upper + 1)))
         latent = self.encoder(context, self.velocity_scale, rng)
-        shape = self.config.moments_per_step, len(case.body.node_counts)
-        moments = torch.from_numpy(rng.integers(context.size - 1, case.frames - 1, shape))
-        moments = moments.to(case.positions.device)
+        drawn = case.body.drawn_per_body(
+            lambda count: rng.integers(
+                context.size - 1, case.frames - 1, (self.config.moments_per_step, count)
+            )
+        )
+        moments = torch.from_numpy(drawn).to(case.positions.device)
         return self.simulator.loss(case, moments, self.velocity_scale, rng, latent)
 
 

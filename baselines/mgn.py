@@ -132,7 +132,9 @@ class StepSimulator(nn.Module):
         earliest = case.positions[(frame - 2).clamp(min=0), nodes]
         path = [case.collider_path[collider_frame + shift, collider_nodes] for shift in (-1, 0, 1)]
         # A random walk: independent draws add up to the noise of two movements, and those to positions.
-        drawn = rng.standard_normal((2, *now.shape), dtype=np.float32) * (self.config.noise / 2**0.5)
+        drawn = body.drawn_per_node(
+            lambda count: rng.standard_normal((2, len(moments), count, now.shape[-1]), dtype=np.float32)
+        ) * (self.config.noise / 2**0.5)
         walk = torch.from_numpy(drawn).to(now.device).cumsum(0).cumsum(0) * ~body.fixed[:, None]
         before, now = before + walk[0], now + walk[1]
         state = State(now, (now - before, before - earliest), path[1], (path[2] - path[1], path[1] - path[0]))
@@ -162,8 +164,8 @@ class MeshGraphNet(Model):
 
     def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
         """Squared error of one noisy step from a random frame of each trajectory, free nodes only."""
-        moments = torch.from_numpy(rng.integers(1, case.frames - 1, (1, len(case.body.node_counts))))
-        moments = moments.to(case.positions.device)
+        drawn = case.body.drawn_per_body(lambda count: rng.integers(1, case.frames - 1, (1, count)))
+        moments = torch.from_numpy(drawn).to(case.positions.device)
         return self.simulator.loss(case, moments, self.velocity_scale, rng, self._material(case.body))
 
     def _material(self, body: Body) -> Tensor | None:

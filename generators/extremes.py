@@ -283,8 +283,13 @@ _EXTREMES: dict[str, Callable[[], Extremes]] = {
 }
 
 
+def has_extremes(scene: str) -> bool:
+    """Whether a scene has a grid: our own have."""
+    return scene in _EXTREMES
+
+
 def extremes_of(scene: str) -> Extremes:
-    """The grid of a scene. Raises GeneratorError if there is no such scene."""
-    if scene not in _EXTREMES:
-        raise GeneratorError(unknown_name("scene", scene, list(_EXTREMES)))
+    """The grid of a scene. Raises GeneratorError if it has none (lists those that have)."""
+    if not has_extremes(scene):
+        raise GeneratorError(unknown_name("extremes of scene", scene, list(_EXTREMES)))
     return _EXTREMES[scene]()

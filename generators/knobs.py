@@ -254,7 +254,7 @@ _KNOBS: dict[str, Callable[[], Knobs]] = {
 
 
 def knobs_of(task: str) -> Knobs:
-    """The knobs of a task's scene. Raises GeneratorError if there is no such task."""
+    """The knobs of a task's scene. Raises GeneratorError if it has none (lists those that have)."""
     if task not in _KNOBS:
-        raise GeneratorError(unknown_name("task", task, list(_KNOBS)))
+        raise GeneratorError(unknown_name("knobs of task", task, list(_KNOBS)))
     return _KNOBS[task]()

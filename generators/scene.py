@@ -1,14 +1,15 @@
 """What a scene is, and which scenes there are."""
 
 import logging
-from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import version
+from inspect import signature
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.plugins import blamed_on_package, load, plugins, usable
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.generators.errors import GeneratorError
@@ -118,7 +119,7 @@ class SimulatedWithScikitFem:
 
 
 # Imported on demand: a scene loads only the simulator that it needs.
-_SCENES = {
+OWN_SCENES = {
     "sheet_deformation": "m3gn_bench.generators.sheet_deformation:SheetDeformation",
     "deformable_block": "m3gn_bench.generators.deformable_block:DeformableBlock",
     "tissue_manipulation": "m3gn_bench.generators.tissue_manipulation:TissueManipulation",
@@ -127,9 +128,19 @@ _SCENES = {
 }
 
 
+# What a scene must have; that a class defines all of it shows only once it is used.
+_MEMBERS = (*Scene.__annotations__, *(name for name in vars(Scene) if not name.startswith("_")))
+
+
 def scene_names() -> list[str]:
-    """All scenes."""
-    return list(_SCENES)
+    """All scenes: our own, then those of other packages, whether they can be used or not."""
+    return [*OWN_SCENES, *(name for name in plugins("scene") if name not in OWN_SCENES)]
+
+
+def usable_scenes() -> dict[str, Scene]:
+    """All scenes as the benchmark has them, without those of packages that cannot be used."""
+    own = {name: get_scene(name) for name in OWN_SCENES}
+    return own | dict(usable("scene", get_scene, OWN_SCENES))
 
 
 def get_scene(name: str, **options: Any) -> Scene:
@@ -137,12 +148,28 @@ def get_scene(name: str, **options: Any) -> Scene:
 
     Raises:
         GeneratorError: no such scene (lists all), or it has no such option (lists its own).
+        PluginError: it belongs to another package, which cannot be used (names the package).
     """
-    if name not in _SCENES:
+    if name in OWN_SCENES:
+        module, attribute = OWN_SCENES[name].split(":")
+        scene: Scene = _make(getattr(import_module(module), attribute), name, options)
+        return scene
+    if name not in plugins("scene"):
         raise GeneratorError(unknown_name("scene", name, scene_names()))
-    module, attribute = _SCENES[name].split(":")
-    scene = getattr(import_module(module), attribute)
-    known = [field.name for field in fields(scene)]
+    make = load("scene", name)
+    with blamed_on_package("scene", name):
+        scene = _make(make, name, options)
+        missing = [member for member in _MEMBERS if not hasattr(scene, member)]
+        if missing:
+            raise TypeError(f"it is no Scene, for it has no {', '.join(missing)}")
+        if scene.name != name:
+            raise ValueError(f"the scene calls itself {scene.name!r}")
+    return scene
+
+
+def _make(make: Any, name: str, options: dict[str, Any]) -> Any:
+    """Call a scene's class, or what returns a scene, with options that it knows."""
+    known = list(signature(make).parameters)
     for option in options:
         if option not in known:
             raise GeneratorError(
@@ -150,4 +177,4 @@ def get_scene(name: str, **options: Any) -> Scene:
                 if known
                 else f"{name} has no options, so no {option!r} either"
             )
-    return scene(**options)
+    return make(**options)

@@ -11,7 +11,7 @@ from typing import Literal
 
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.summary import entries, middle, probability_of_less
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.tasks import OWN_TASKS
 
 CONFIDENCE = 0.975
 Outcome = Literal["holds", "contradicted", "undecided", "not measured yet"]
@@ -73,7 +73,7 @@ def _on(track: str, tasks: Sequence[str], better: str, *worse: str) -> tuple[Com
 def _more_context(track: str, tasks: Sequence[str], model: str) -> tuple[Comparison, ...]:
     found = []
     for task in tasks:
-        first, *_, last = sorted(TASKS[task].context_sizes)
+        first, *_, last = sorted(OWN_TASKS[task].context_sizes)
         found.append(Comparison(track, task, model, model, last, first))
     return tuple(found)
 
@@ -87,7 +87,7 @@ CLAIMS = (
     Claim(
         "M3GN simulates more accurately than MGN",
         "section 6, main results; figure of the full-rollout MSE",
-        _on("compact", [task for task in TASKS if task != "tissue_manipulation"], "m3gn", "mgn"),
+        _on("compact", [task for task in OWN_TASKS if task != "tissue_manipulation"], "m3gn", "mgn"),
     ),
     Claim(
         "On Tissue Manipulation step-based MGN is slightly ahead of M3GN",
@@ -102,7 +102,7 @@ CLAIMS = (
     Claim(
         "A later anchor improves M3GN's accuracy",
         "section 6, main results",
-        _more_context("compact", list(TASKS), "m3gn"),
+        _more_context("compact", list(OWN_TASKS), "m3gn"),
         "The part that is left to predict gets shorter, too.",
     ),
     Claim(
@@ -199,7 +199,7 @@ def render_claims(records: Sequence[ResultRecord]) -> str:
             lines += ["", claim.remark]
         lines += ["", "| task | comparison | errors | P | |", "| --- | --- | --- | --: | --- |"]
         lines += [
-            f"| {TASKS[comparison.task].title} | {_described(comparison)} | {numbers} | {outcome} |"
+            f"| {OWN_TASKS[comparison.task].title} | {_described(comparison)} | {numbers} | {outcome} |"
             for comparison, (outcome, numbers) in zip(claim.comparisons, outcomes, strict=True)
         ]
     return "\n".join([*lines, ""])

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.summary import Entry, entries, middle
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.leaderboard.summary import Entry, entries, middle, titles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +48,7 @@ def draw_board(records: Sequence[ResultRecord], track: str, task: str) -> "Figur
         xlabel="context frames",
         ylabel="full-rollout MSE",
         xticks=rows[0].contexts,
-        title=TASKS[task].title,
+        title=titles(records)[task],
     )
     over_time.set(yscale="log", xlabel="frame", ylabel="MSE of the frame", title=f"after {at} context frames")
     over_context.legend(fontsize=8)

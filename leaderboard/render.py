@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable, Sequence
 
+from m3gn_bench.leaderboard.figures import STYLES
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_of_less
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_of_less, titles
 
 FIGURES = "figures"  # the folder beside the page
 
@@ -38,11 +38,11 @@ def render(records: Sequence[ResultRecord]) -> str:
     found = {record.track for record in records}
     for track in [name for name in TRACKS if name in found] + sorted(found - set(TRACKS)):
         parts.append(f"## Track: {track}\n\n{TRACKS.get(track, '')}\n")
-        for name, task in TASKS.items():
+        for name, title in titles(records).items():
             rows = entries(records, track, name)
             if rows:
-                parts.append(_task_table(task.title, rows))
-                if track == "compact":
+                parts.append(_task_table(title, rows))
+                if track == "compact" and any(row.label in STYLES for row in rows):
                     parts.append(f"![Errors over context frames and over time]({FIGURES}/{name}.svg)\n")
         if track == "compact":
             parts.append(_runtimes(records, track))
@@ -82,7 +82,8 @@ def _task_table(title: str, rows: Sequence[Entry]) -> str:
 
 
 def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
-    boards = {name: {row.label: row for row in entries(records, track, name)} for name in TASKS}
+    shown = titles(records)
+    boards = {name: {row.label: row for row in entries(records, track, name)} for name in shown}
     boards = {name: rows for name, rows in boards.items() if rows}
     models = dict.fromkeys(label for rows in boards.values() for label in rows)
     lines = [
@@ -90,7 +91,7 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
         "",
         "Milliseconds for a trajectory, mean over context sizes; one thread, batches of four, two processes at once.",
         "",
-        _row(["model", *(TASKS[name].title for name in boards)]),
+        _row(["model", *(shown[name] for name in boards)]),
         _row(["---", *("--:" for _ in boards)]),
     ]
     for label in models:

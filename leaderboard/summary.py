@@ -8,6 +8,7 @@ import numpy as np
 
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.metrics import bootstrap_means
+from m3gn_bench.tasks import TASKS
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,12 @@ def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entr
             groups.setdefault((record.model, record.preset, record.variant), []).append(record)
     found = [Entry(tuple(sorted(group, key=lambda r: r.seed))) for group in groups.values()]
     return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
+
+
+def titles(records: Sequence[ResultRecord]) -> dict[str, str]:
+    """Titles of all tasks by name; one that only records know (its package is not here) has its name for a title."""
+    known = {name: task.title for name, task in TASKS.items()}
+    return known | {record.task: record.task for record in records if record.task not in known}
 
 
 def middle(contexts: Sequence[int]) -> int:

@@ -38,6 +38,7 @@ class Checkpoint(Record):
         minutes: training time (on a CPU: CPU time of training steps).
         validation_error: mean full-rollout MSE over context sizes of the kept weights; None if not trained.
         dataset_hash: content hash of the data trained on (training and validation split).
+        processes: how many trained it together, each with a device and threads of its own.
     """
 
     task: str
@@ -51,6 +52,7 @@ class Checkpoint(Record):
     dataset_hash: str
     device: str
     threads: int
+    processes: int = 1
     package_version: str
     weights_sha256: str = ""
 

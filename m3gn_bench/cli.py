@@ -52,12 +52,13 @@ def run(arguments: Sequence[str] | None = None) -> None:
 def list_command(as_json: bool) -> None:
     """Scenes, tasks, tiers, models and presets, with the number of parameters of each."""
     from m3gn_bench.datasets.schema import TIERS, tier_sizes
-    from m3gn_bench.generators.scene import get_scene, scene_names
-    from m3gn_bench.model import PRESETS, model_names
+    from m3gn_bench.generators.scene import usable_scenes
+    from m3gn_bench.model import PRESETS
     from m3gn_bench.published import published_parameters
     from m3gn_bench.sizes import parameter_counts
-    from m3gn_bench.tasks import TASKS
+    from m3gn_bench.sources import usable_tasks
 
+    used = usable_tasks()
     scenes: list[dict[str, Any]] = [
         {
             "name": scene.name,
@@ -66,7 +67,7 @@ def list_command(as_json: bool) -> None:
             "sizes": scene.paper_sizes,
             "fidelities": list(scene.fidelities),
         }
-        for scene in map(get_scene, scene_names())
+        for scene in usable_scenes().values()
     ]
     tasks: list[dict[str, Any]] = [
         {
@@ -85,10 +86,9 @@ def list_command(as_json: bool) -> None:
                 for tier in TIERS
             },
         }
-        for task in TASKS.values()
-        for scene in [get_scene(task.scene)]
+        for task, scene in used
     ]
-    counts = parameter_counts()
+    counts = parameter_counts([task for task, _ in used])
     models = [
         {
             "name": name,
@@ -146,8 +146,7 @@ def list_command(as_json: bool) -> None:
             ["model", "task", *PRESETS],
             [
                 [name, task, *(shown_count(name, p, task) for p in PRESETS)]
-                for name in model_names()
-                for task in TASKS
+                for name, task in dict.fromkeys((name, task) for name, _, task in counts)
             ],
         ),
     )

@@ -53,14 +53,18 @@ class Report:
 
     Args:
         as_json: print one JSON object instead of text.
+        silent: print nothing; another process does.
     """
 
-    def __init__(self, as_json: bool) -> None:
+    def __init__(self, as_json: bool, silent: bool = False) -> None:
         self.as_json = as_json
+        self.silent = silent
         self.errors = Console(stderr=True)
 
     def finish(self, record: dict[str, object], *texts: str | Table) -> None:
         """Print the record as JSON, or else the texts and tables."""
+        if self.silent:
+            return
         if self.as_json:
             click.echo(json.dumps(_finite(record), indent=2, allow_nan=False))
             return
@@ -80,7 +84,7 @@ class Report:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        shown = self.errors.is_terminal and not self.as_json
+        shown = self.errors.is_terminal and not self.as_json and not self.silent
         with Progress(*columns, console=self.errors, disable=not shown, transient=True) as bar:
             task = bar.add_task(description, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)

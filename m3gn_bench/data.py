@@ -1,6 +1,6 @@
 """From stored trajectories to what models see: scaled tensors, and no more of the future than is allowed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,20 @@ from m3gn_bench.errors import ConfigError
 from m3gn_bench.tasks import Task
 
 
+@dataclass(frozen=True)
+class Share:
+    """What part of a batch some bodies are, where several processes have a part each (see `distributed`).
+
+    Attributes:
+        node_counts, collider_counts: number of mesh and of collider nodes of each body of the whole batch.
+        first: the first body that is here; the others follow it.
+    """
+
+    node_counts: tuple[int, ...]
+    collider_counts: tuple[int, ...]
+    first: int
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """What is known of one or several deformable bodies and their colliders and does not change with time.
@@ -33,6 +47,7 @@ class Body:
         material: scaled material parameters, one row per body, shape [bodies, materials].
         collider_edges: sender and receiver among collider nodes, shape [2, collider_edges].
         node_counts, collider_counts: number of mesh and of collider nodes of each body.
+        share: what part of a batch this is; None: all of it.
     """
 
     rest_positions: Tensor
@@ -43,6 +58,7 @@ class Body:
     collider_edges: Tensor
     node_counts: tuple[int, ...]
     collider_counts: tuple[int, ...]
+    share: Share | None = None
 
     @property
     def nodes(self) -> int:
@@ -53,6 +69,11 @@ class Body:
     def collider_nodes(self) -> int:
         """Number of collider nodes of all bodies."""
         return sum(self.collider_counts)
+
+    @cached_property
+    def free_nodes(self) -> int:
+        """Number of mesh nodes that may move."""
+        return int((~self.fixed).sum())
 
     @cached_property
     def body_of_node(self) -> Tensor:
@@ -69,6 +90,35 @@ class Body:
         """Vector at rest from receiver to sender of each mesh edge, and its length, shape [edges, dim + 1]."""
         senders, receivers = self.edges
         return with_length(self.rest_positions[senders] - self.rest_positions[receivers])
+
+    def drawn_per_body(self, draw: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Random numbers for bodies, along the last axis.
+
+        Args:
+            draw: gives so many. A share of a batch has them drawn for the whole batch and keeps its own, so that it
+                does not matter how many processes share it.
+        """
+        whole = self.share or self
+        return self._drawn(draw, (1,) * len(whole.node_counts), -1)
+
+    def drawn_per_node(self, draw: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Random numbers for mesh nodes, along the last axis but one; see `drawn_per_body`."""
+        whole = self.share or self
+        return self._drawn(draw, whole.node_counts, -2)
+
+    def drawn_per_collider_node(self, draw: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Random numbers for collider nodes, along the last axis but one; see `drawn_per_body`."""
+        whole = self.share or self
+        return self._drawn(draw, whole.collider_counts, -2)
+
+    def _drawn(self, draw: Callable[[int], np.ndarray], counts: tuple[int, ...], axis: int) -> np.ndarray:
+        """Those of own bodies, of whose counts along the axis `counts` tells for the whole batch."""
+        values = draw(sum(counts))
+        if self.share is None:
+            return values
+        stop = self.share.first + len(self.node_counts)
+        own = np.arange(sum(counts[: self.share.first]), sum(counts[:stop]))
+        return values.take(own, axis)
 
     def _spread(self, counts: tuple[int, ...]) -> Tensor:
         numbers = torch.tensor(counts, device=self.fixed.device)

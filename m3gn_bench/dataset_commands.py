@@ -6,10 +6,14 @@ from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import click
 
 from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, Report
+
+if TYPE_CHECKING:
+    from m3gn_bench.generators.scene import Scene
 
 SHIPPED = "compact"  # preset of the checkpoints that are drawn
 
@@ -301,11 +305,10 @@ def card(file: Path, as_json: bool) -> None:
     from m3gn_bench.datasets.recorded import record, require_own
     from m3gn_bench.datasets.writer import write_bytes_atomically
     from m3gn_bench.generators.material_effect import material_effect
-    from m3gn_bench.generators.scene import get_scene
 
     require_own(file)
     with open_file(file) as opened:
-        scene = get_scene(read_metadata(opened).scene)
+        scene = _recorded_scene(read_metadata(opened).scene)
     effect = f"{material_effect(scene):.3g}"
     path = CARDS / f"{scene.name}.md"
     block = numbers(file, [("softest against stiffest material, mean squared difference, scaled", effect)])
@@ -314,6 +317,20 @@ def card(file: Path, as_json: bool) -> None:
     Report(as_json).finish(
         {"card": str(path), "record": str(recorded)}, f"{path}: written\n{recorded}: written"
     )
+
+
+def _recorded_scene(name: str) -> "Scene":
+    """A scene whose card and hashes the project holds: one of our own."""
+    from m3gn_bench.generators.errors import GeneratorError
+    from m3gn_bench.generators.scene import OWN_SCENES, get_scene
+
+    scene = get_scene(name)
+    if name not in OWN_SCENES:
+        raise GeneratorError(
+            f"{name} is the scene of another package: its card and its hashes are not kept here, but only those of "
+            f"{', '.join(sorted(OWN_SCENES))}"
+        )
+    return scene
 
 
 @click.command()
@@ -328,10 +345,10 @@ def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) ->
     """
     from m3gn_bench.datasets.recorded import compare, read_record
     from m3gn_bench.generators.generate import generate as generate_dataset
-    from m3gn_bench.generators.scene import get_scene, scene_names
+    from m3gn_bench.generators.scene import OWN_SCENES
 
-    names = scene_names()
-    scene = get_scene(scene_name or names[date.today().toordinal() % len(names)])
+    names = list(OWN_SCENES)
+    scene = _recorded_scene(scene_name or names[date.today().toordinal() % len(names)])
     read_record(scene.name).require(scene.dataset_version, tier)  # before the work, not after it
     report = Report(as_json)
     with TemporaryDirectory() as folder, report.progress(f"simulating {scene.name}") as on_progress:

@@ -5,7 +5,7 @@ import platform
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.plugins import Kind, package_of, plugins
 from m3gn_bench.datasets.recorded import TOLERANCE, probe, read_record
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.version import __version__
@@ -46,7 +47,7 @@ def examine(data: Path, self_test: bool, on_progress: Callable[[int, int], None]
         self_test: also simulate a trajectory of every scene and run a shipped model, which takes half a minute.
         on_progress: called with (done, total) after every part.
     """
-    parts = [machine, libraries, devices, lambda: disk(data), meshes, board]
+    parts = [machine, libraries, packages, devices, lambda: disk(data), meshes, board]
     if self_test:
         parts += [simulations, predictions]
     found: list[Finding] = []
@@ -90,6 +91,33 @@ def libraries() -> Iterator[Finding]:
     for extra_name, names in missing.items():
         advice = f"without {', '.join(names)}; pip install 'm3gn-bench[{extra_name}]'"
         yield Finding(part="extra", name=extra_name, state="missing", detail=advice)
+
+
+def packages() -> Iterator[Finding]:
+    """What other packages add, and whether it can be used."""
+    from m3gn_bench.generators.scene import OWN_SCENES, get_scene
+    from m3gn_bench.model import get_model_class
+    from m3gn_bench.tasks import OWN_TASKS, get_task
+
+    # A package may not take a name of ours, and it is ours that would be found.
+    kinds: dict[Kind, tuple[Callable[[str], object], Collection[str]]] = {
+        "scene": (get_scene, OWN_SCENES),
+        "task": (get_task, OWN_TASKS),
+        "model": (get_model_class, ()),
+    }
+    for kind, (get, own) in kinds.items():
+        for name in plugins(kind):
+            package = package_of(kind, name)
+            if package == DISTRIBUTION:
+                continue
+            try:
+                get(name)
+            except BenchError as error:
+                yield Finding(part=kind, name=name, state="wrong", detail=str(error))
+                continue
+            taken = name in own
+            detail = f"the name is taken; {package} needs another" if taken else f"of the package {package}"
+            yield Finding(part=kind, name=name, state="wrong" if taken else "fine", detail=detail)
 
 
 def devices() -> Iterator[Finding]:
@@ -153,11 +181,11 @@ def board() -> Iterator[Finding]:
 
 
 def simulations() -> Iterator[Finding]:
-    """One trajectory of every scene, simulated anew and compared with what is on record."""
+    """One trajectory of each of our scenes, simulated anew and compared with what is on record."""
     from m3gn_bench.generators.generate import simulate_one
-    from m3gn_bench.generators.scene import get_scene, scene_names
+    from m3gn_bench.generators.scene import OWN_SCENES, get_scene
 
-    for name in scene_names():
+    for name in OWN_SCENES:
         scene, start = get_scene(name), time.perf_counter()
         try:
             expected = read_record(name).probes["test_00000"]

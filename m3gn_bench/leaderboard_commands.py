@@ -74,7 +74,7 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
     from m3gn_bench.leaderboard.record import HOME, read_records
     from m3gn_bench.leaderboard.render import FIGURES
     from m3gn_bench.leaderboard.render import render as render_page
-    from m3gn_bench.tasks import TASKS
+    from m3gn_bench.leaderboard.summary import titles
 
     folder = home or HOME
     records = read_records(folder)
@@ -87,7 +87,7 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
         if not check:
             write_bytes_atomically(path, content)
     if not check:
-        for task in TASKS:
+        for task in titles(records):
             figure = draw_board(records, "compact", task)
             if figure is not None:
                 save(figure, folder / FIGURES / f"{task}.svg")

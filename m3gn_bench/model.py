@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
-from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -16,10 +15,9 @@ from torch import Tensor, nn
 
 from m3gn_bench.data import Case, Context
 from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.plugins import load, plugins, usable
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.tasks import Task
-
-ENTRY_POINTS = "m3gn_bench.models"
 
 
 class ModelConfig(BaseModel):
@@ -95,7 +93,11 @@ class Model(nn.Module):
         self.displacement_scale.fill_(float(np.concatenate(moved).std(dtype=np.float64)))
 
     def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
-        """The loss of one step on a batch of trajectories; all randomness comes from `rng`."""
+        """The loss of one step on a batch of trajectories: a mean over its free nodes.
+
+        All randomness comes from `rng`; numbers for every body or node are drawn with the methods of `case.body`, or
+        several processes could not share a batch.
+        """
         raise NotImplementedError(f"{type(self).__name__} is not trained")
 
     def predict(self, context: Context) -> Tensor:
@@ -132,15 +134,26 @@ def hold_fixed(context: Context, positions: Tensor) -> Tensor:
 
 def model_names() -> list[str]:
     """All registered models, ours and other packages'."""
-    return sorted(entry.name for entry in entry_points(group=ENTRY_POINTS))
+    return sorted(plugins("model"))
 
 
-@cache  # looking through all installed packages takes milliseconds
+def usable_models() -> dict[str, type[Model]]:
+    """The classes of all registered models, without those of packages that cannot be imported."""
+    return dict(usable("model", get_model_class))
+
+
+@cache
 def get_model_class(name: str) -> type[Model]:
-    """The class of a registered model. Raises ConfigError listing all models if there is none."""
-    for entry in entry_points(group=ENTRY_POINTS, name=name):
-        return entry.load()
-    raise ConfigError(unknown_name("model", name, model_names()))
+    """The class of a registered model.
+
+    Raises:
+        ConfigError: there is none (lists all).
+        PluginError: its package cannot be imported (names the package).
+    """
+    if name not in plugins("model"):
+        raise ConfigError(unknown_name("model", name, model_names()))
+    found: type[Model] = load("model", name)
+    return found
 
 
 class RunConfig(BaseModel):

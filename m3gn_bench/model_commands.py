@@ -69,16 +69,22 @@ def train(
     data: Path,
     as_json: bool,
 ) -> None:
-    """Train a model and leave a checkpoint. A run that was interrupted goes on where it stopped."""
+    """Train a model and leave a checkpoint. A run that was interrupted goes on where it stopped.
+
+    Several processes that torchrun started share every batch: see docs/scale.md.
+    """
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file
+    from m3gn_bench.distributed import torchrun_group
     from m3gn_bench.model import build_model, load_preset
     from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import get_task
     from m3gn_bench.training import Progress, require_budget, tensorboard_observer, usable_device
     from m3gn_bench.training import train as train_model
 
-    report = Report(as_json)
+    usable_device(device)
+    group = click.get_current_context().with_resource(torchrun_group(device))
+    report = Report(as_json, silent=not group.leads)
     spec = get_task(task)
     if dataset is not None:
         spec, tier = given(dataset, task)
@@ -87,11 +93,11 @@ def train(
     config = load_preset(model, preset, spec, overrides)
     # Whatever can be refused is refused before data are simulated.
     require_budget(config, build_model(config, spec).is_learned)
-    usable_device(device)
-    curves = tensorboard_observer(out) if tensorboard else None
+    group.require_shares(config.training.batch_size)
+    curves = tensorboard_observer(out) if tensorboard and group.leads else None
     path = dataset
     if path is None:
-        with report.progress(f"simulating {spec.scene}") as on_progress:
+        with group.first_alone(), report.progress(f"simulating {spec.scene}") as on_progress:
             path = find_or_generate(
                 spec, tier, data, splits=("train", "validation"), workers=workers, on_progress=on_progress
             )
@@ -115,6 +121,7 @@ def train(
             dataset_hash=dataset_hash,
             device=device,
             threads=threads,
+            group=group,
             observe=observe,
         )
     error = (

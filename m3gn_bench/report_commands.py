@@ -115,15 +115,13 @@ def _rollouts(
     report: Report, records: "list[ResultRecord]", home: Path, tier: str, data: Path, workers: int
 ) -> "tuple[list[Rollouts], list[str]]":
     """Rollouts of every task that has checkpoints which ship, and why others are left out."""
-    from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.leaderboard.site.rollouts import roll_out, runnable
-    from m3gn_bench.sources import find_or_generate
-    from m3gn_bench.tasks import TASKS
+    from m3gn_bench.sources import find_or_generate, usable_tasks
 
     made: list[Rollouts] = []
     left_out: list[str] = []
-    for task in TASKS.values():
-        models, reasons = runnable(records, task, get_scene(task.scene).dataset_version, home)
+    for task, scene in usable_tasks():
+        models, reasons = runnable(records, task, scene.dataset_version, home)
         left_out += reasons
         if not models:
             continue

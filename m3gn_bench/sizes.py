@@ -1,18 +1,19 @@
 """How many parameters each model has under each preset on each task."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 
-from m3gn_bench.model import PRESETS, ModelConfig, get_model_class, load_preset, model_names
-from m3gn_bench.tasks import TASKS, Task
+from m3gn_bench.model import PRESETS, ModelConfig, get_model_class, load_preset, usable_models
+from m3gn_bench.tasks import Task
 
 
-def parameter_counts() -> dict[tuple[str, str, str], int]:
-    """Number of trainable parameters by model, preset and task."""
+def parameter_counts(tasks: Iterable[Task]) -> dict[tuple[str, str, str], int]:
+    """Number of trainable parameters by model, preset and task: of all models that can be used."""
     return {
         (name, preset, task.name): _count(name, load_preset(name, preset, task).model, _shape(task))
-        for task in TASKS.values()
-        for name in model_names()
+        for name in sorted(usable_models())
+        for task in tasks
         for preset in PRESETS
     }
 

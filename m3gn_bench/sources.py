@@ -7,12 +7,18 @@ evaluation work without a simulator installed.
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from m3gn_bench.data import Case, case_from
+from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.file import find_dataset, open_file, read_metadata
+from m3gn_bench.datasets.plugins import leave_out
 from m3gn_bench.datasets.schema import SPLITS, Split, parse_key
 from m3gn_bench.datasets.trajectory import Trajectory
-from m3gn_bench.tasks import Task, task_of_data
+from m3gn_bench.tasks import TASKS, Task, task_of_data
+
+if TYPE_CHECKING:
+    from m3gn_bench.generators.scene import Scene
 
 
 def find_or_generate(
@@ -52,6 +58,20 @@ def find_or_generate(
         executor=executor,
         on_progress=on_progress,
     ).file
+
+
+def usable_tasks() -> "list[tuple[Task, Scene]]":
+    """All tasks with their scenes, without those of packages that cannot be used."""
+    from m3gn_bench.generators.scene import scene_names, usable_scenes
+
+    scenes = usable_scenes()
+    found = []
+    for task in TASKS.values():
+        if task.scene in scenes:
+            found.append((task, scenes[task.scene]))
+        elif task.scene not in scene_names():  # a scene that is there, but unusable, was named already
+            leave_out(f"task {task.name!r}: {unknown_name('scene', task.scene, scene_names())}")
+    return found
 
 
 def given(path: Path, name: str) -> tuple[Task, str]:

@@ -151,13 +151,18 @@ def stability(
 ) -> None:
     """Simulators and models at their extremes; exit code 1 if any cell is wrong.
 
-    Without TASK, every task. Takes some minutes each; an interrupted run goes on where it stopped.
+    Without TASK, every task whose scene says what its extremes are. Takes some minutes each; an interrupted run goes on
+    where it stopped.
     """
+    from m3gn_bench.generators.extremes import has_extremes
     from m3gn_bench.stability import measure
     from m3gn_bench.tasks import TASKS, get_task
 
     report = Report(as_json)
-    tasks = list(TASKS.values()) if task_name is None else [get_task(task_name)]
+    if task_name is None:
+        tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
+    else:
+        tasks = [get_task(task_name)]
     chosen = [(task, _checkpoints(task, folders)) for task in tasks]
     results, studies = [], []
     for task, shipped in chosen:

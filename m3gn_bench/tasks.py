@@ -12,12 +12,14 @@ paper leaves a choice.
   are given over all nodes, and over free nodes only, which the former dilutes. Collider nodes are not scored.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
+from m3gn_bench.datasets.plugins import blamed_on_package, load, plugins, usable
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import FIXED, Trajectory
 from m3gn_bench.errors import ConfigError
@@ -39,9 +41,13 @@ class MaterialFeature:
         return float(2 * (scale(value) - lower) / (upper - lower) - 1)
 
 
+def _no_static_features(trajectory: Trajectory) -> np.ndarray:
+    return np.zeros((len(trajectory.mesh.rest_positions), 0), np.float32)
+
+
 @dataclass(frozen=True)
 class Task:
-    """A task.
+    """A task. Without more being said, nodes have no static features, and nothing but themselves to meet.
 
     Attributes:
         name: as used on the command line.
@@ -49,14 +55,14 @@ class Task:
         scene: the generator whose dataset file holds the task's split.
         dimension: of space.
         frames: states per trajectory.
+        material: what a model with material information is told.
+        context_sizes: numbers of context frames at which the task is scored.
+        training_context: smallest and largest number of context frames in training.
         static_features: names of the static node features.
         static: computes them from a trajectory, shape [nodes, len(static_features)].
         has_collider: whether a rigid body with a known path takes part.
         collider_has_edges: whether it has edges of its own (a single grasping point has none).
         height_feature: whether nodes know their last coordinate, which stands for the ground.
-        material: what a model with material information is told.
-        context_sizes: numbers of context frames at which the task is scored.
-        training_context: smallest and largest number of context frames in training.
         m3gn_history: past velocities among the simulator's inputs in M3GN (paper's parameter counts).
     """
 
@@ -65,15 +71,15 @@ class Task:
     scene: str
     dimension: int
     frames: int
-    static_features: tuple[str, ...]
-    static: Callable[[Trajectory], np.ndarray]
-    has_collider: bool
-    collider_has_edges: bool
-    height_feature: bool
     material: tuple[MaterialFeature, ...]
     context_sizes: tuple[int, ...]
     training_context: tuple[int, int]
-    m3gn_history: int
+    static_features: tuple[str, ...] = ()
+    static: Callable[[Trajectory], np.ndarray] = _no_static_features
+    has_collider: bool = False
+    collider_has_edges: bool = False
+    height_feature: bool = False
+    m3gn_history: int = 0
 
     @property
     def node_types(self) -> int:
@@ -99,10 +105,6 @@ class Task:
     def edge_features(self) -> int:
         """Length of the edge features: type, rest vector and length, current vector and length."""
         return self.edge_types + 2 * (self.dimension + 1)
-
-
-def _no_static_features(trajectory: Trajectory) -> np.ndarray:
-    return np.zeros((len(trajectory.mesh.rest_positions), 0), np.float32)
 
 
 SHEET_FORCE_SCALE = 200.0  # [N], the magnitude of each force
@@ -151,7 +153,7 @@ def _falling(name: str, title: str) -> Task:
     )
 
 
-TASKS: dict[str, Task] = {
+OWN_TASKS: dict[str, Task] = {
     task.name: task
     for task in (
         _sheet("sheet_deformation", "Sheet Deformation"),
@@ -194,8 +196,51 @@ TASKS: dict[str, Task] = {
 }
 
 
+class _Tasks(Mapping[str, Task]):
+    """Our own tasks, then those of other packages: loaded only where it is they, or all, that are asked for.
+
+    Iteration goes on without a package that cannot be used; looking up its task raises PluginError.
+    """
+
+    def __getitem__(self, name: str) -> Task:
+        if name in OWN_TASKS:
+            return OWN_TASKS[name]
+        if name not in plugins("task"):
+            raise KeyError(name)
+        return task_of_package(name)
+
+    def __iter__(self) -> Iterator[str]:
+        yield from OWN_TASKS
+        for name, _ in usable("task", task_of_package, OWN_TASKS):
+            yield name
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+@cache
+def task_of_package(name: str) -> Task:
+    """What an entry point gives: a task, or a callable that returns one."""
+    found = load("task", name)
+    with blamed_on_package("task", name):
+        task = found() if callable(found) else found
+        if not isinstance(task, Task):
+            raise TypeError(f"it is no Task but of type {type(task).__name__}")
+        if task.name != name:
+            raise ValueError(f"the task calls itself {task.name!r}")
+    return task
+
+
+TASKS: Mapping[str, Task] = _Tasks()
+
+
 def get_task(name: str) -> Task:
-    """The task of that name. Raises ConfigError listing all tasks if there is none."""
+    """The task of that name.
+
+    Raises:
+        ConfigError: there is none (lists all).
+        PluginError: it belongs to another package, which cannot be used (names the package).
+    """
     if name not in TASKS:
         raise ConfigError(unknown_name("task", name, list(TASKS)))
     return TASKS[name]

@@ -3,7 +3,7 @@
 The whole state (weights, optimiser, best weights so far, random generator, counters) is one safetensors
 file in the output folder, replaced atomically. A run that is killed and started again goes on from it; with
 a budget in steps it ends, on a CPU, with exactly the weights of a run that was never killed. Finished runs leave a
-checkpoint (see `checkpoint`) and no state.
+checkpoint (see `checkpoint`) and no state. Several processes may share the work (see `distributed`).
 """
 
 import json
@@ -27,8 +27,9 @@ from m3gn_bench.checkpoint import (
     save_checkpoint,
 )
 from m3gn_bench.cpu import use_cpu
-from m3gn_bench.data import Case, join
+from m3gn_bench.data import Case
 from m3gn_bench.datasets.writer import write_bytes_atomically
+from m3gn_bench.distributed import ALONE, Group
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.model import Model, RunConfig, build_model
@@ -66,6 +67,7 @@ def train(
     dataset_hash: str,
     device: str = "cpu",
     threads: int = 1,
+    group: Group = ALONE,
     observe: Observer = lambda progress: None,
 ) -> Checkpoint:
     """Train a model to the end of its budget and write its checkpoint.
@@ -79,15 +81,16 @@ def train(
         dataset_hash: content hash of the data, for the record.
         device: torch device.
         threads: CPU threads of torch.
-        observe: called after every step.
+        group: the processes that train together; all of them call this, and the first one writes.
+        observe: called after every step, in the first process.
 
     Raises:
-        ConfigError: no budget, or both kinds.
+        ConfigError: no budget, or both kinds; more processes than trajectories in a batch.
         CheckpointError: the folder holds a different run.
-        TrainingError: the loss is no longer finite.
+        TrainingError: the loss is no longer finite, or the processes fall apart.
     """
     use_cpu(threads)
-    where = usable_device(device)
+    where = usable_device(device) if group.device is None else group.device
     model = build_model(config, task, seed)
     model.prepare(training_cases)
     model.to(where)
@@ -101,9 +104,12 @@ def train(
         "threads": threads,
         "package_version": __version__,
     }
-    if (out / DESCRIPTION).is_file():
+    if group.size > 1:  # states of single processes do not say so
+        describe["processes"] = group.size
+    if group.first((out / DESCRIPTION).is_file()):
         found = read_description(out).model_dump()
-        if any(found[name] != value for name, value in describe.items() if name != "package_version"):
+        expected = {"processes": 1, **describe}
+        if any(found[name] != value for name, value in expected.items() if name != "package_version"):
             raise CheckpointError(
                 f"{out} holds another finished run ({found['task']}, seed {found['seed']}, or other data or "
                 "settings); use another folder"
@@ -111,12 +117,12 @@ def train(
         return read_description(out)
     if not model.is_learned:
         checkpoint = Checkpoint(**describe, steps=0, best_step=0, minutes=0.0, validation_error=None)
-        save_checkpoint(out, model.state_dict(), checkpoint)
-        return read_description(out)
+        return _finish(out, model.state_dict(), checkpoint, group)
     require_budget(config, model.is_learned)
 
-    run = Run(config, model, seed, out, describe)
+    run = Run(config, model, seed, out, describe, group)
     run.resume()
+    group.require_same(run.rng)
     cases = [case.to(where) for case in training_cases]
     held_out = [case.to(where) for case in validation_cases[: config.training.validation_trajectories]]
     clock = time.process_time if where.type == "cpu" else time.perf_counter
@@ -124,14 +130,23 @@ def train(
     while run.progress.fraction < 1:
         start = clock()
         run.step(cases)
-        run.account((clock() - start) / 60)
+        run.account(group.first((clock() - start) / 60))
         if run.validation_due():
             run.validate(held_out, task)
+        if not group.leads:
+            continue
         if time.perf_counter() - saved > SAVE_INTERVAL and run.progress.fraction < 1:
             run.save()
             saved = time.perf_counter()
         observe(run.progress)
-    save_checkpoint(out, run.best_weights, run.description())
+    return _finish(out, run.best_weights, run.description(), group)
+
+
+def _finish(out: Path, weights: dict[str, Tensor], description: Checkpoint, group: Group) -> Checkpoint:
+    """The first process writes the checkpoint; returns what it says."""
+    if not group.leads:
+        return description
+    save_checkpoint(out, weights, description)
     (out / STATE).unlink(missing_ok=True)
     return read_description(out)
 
@@ -171,8 +186,15 @@ class Run:
     """The state of one run and its single steps."""
 
     def __init__(
-        self, config: RunConfig, model: Model, seed: int, out: Path, identity: dict[str, Any]
+        self,
+        config: RunConfig,
+        model: Model,
+        seed: int,
+        out: Path,
+        identity: dict[str, Any],
+        group: Group = ALONE,
     ) -> None:
+        self.group = group
         self.training = config.training
         self.model = model
         self.out = out
@@ -189,21 +211,22 @@ class Run:
         self.best_weights = {name: value.clone() for name, value in model.state_dict().items()}
 
     def step(self, cases: Sequence[Case]) -> None:
-        """One optimiser step on a random batch."""
+        """One optimiser step on a random batch, of which this process has its share."""
         chosen = self.rng.choice(len(cases), min(self.training.batch_size, len(cases)), replace=False)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
         self.optimizer.zero_grad(set_to_none=False)
-        batch = join([cases[i] for i in chosen])
+        batch, part = self.group.share([cases[i] for i in chosen])
         with torch.autocast(
             batch.positions.device.type, torch.bfloat16, enabled=self.training.precision == "bfloat16"
         ):
-            loss = self.model.training_loss(batch, self.rng)
+            loss = part * self.model.training_loss(batch, self.rng)
         loss.backward()
+        self.group.add_up_gradient(self.weights)
         if self.training.gradient_clip is not None:
             nn.utils.clip_grad_norm_(self.weights, self.training.gradient_clip)
         self.optimizer.step()
-        value = loss.item()
+        value = self.group.total(loss.item())
         if not math.isfinite(value):
             raise TrainingError(
                 f"the loss is {value} at step {self.progress.step}; lower training.learning_rate"
@@ -235,8 +258,12 @@ class Run:
 
     def validate(self, cases: Sequence[Case], task: Task) -> None:
         """Mean full-rollout MSE over context sizes; keep the weights if it is the lowest so far."""
-        errors = evaluate_model(self.model, cases, task.context_sizes)
-        error = float(np.mean([e.mse.mean() for e in errors.values()]))
+        self.group.require_same(self.rng)
+        error = math.nan
+        if self.group.leads:
+            errors = evaluate_model(self.model, cases, task.context_sizes)
+            error = float(np.mean([e.mse.mean() for e in errors.values()]))
+        error = self.group.first(error)
         self.progress.validations += 1
         if error < self.progress.best_error:
             self.progress.best_error, self.progress.best_step = error, self.progress.step

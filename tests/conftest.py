@@ -1,4 +1,8 @@
-"""Fixtures that several test files share. The one real dataset is generated once per test run."""
+"""Fixtures that several test files share. The one real dataset is generated once per process of a test run."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side, one in each process (before numpy is loaded)
 
 import zlib
 from collections.abc import Callable

@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,12 @@ from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.data import Body, Case, both_directions, mesh_edges
-from m3gn_bench.model import ENTRY_POINTS, Model, build_model, load_preset
+from m3gn_bench.datasets.plugins import plugins
+from m3gn_bench.model import Model, build_model, load_preset
 from m3gn_bench.tasks import Task, get_task
 
 KINDS = ("sheet_deformation", "deformable_block", "tissue_manipulation", "falling_teddy")
-OURS = sorted(e.name for e in entry_points(group=ENTRY_POINTS) if e.value.startswith("m3gn_bench."))
+OURS = sorted(name for name, entry in plugins("model").items() if entry.value.startswith("m3gn_bench."))
 OUTPUTS = Path(__file__).with_name("model_outputs.json")
 
 

@@ -1,14 +1,9 @@
 """The example of a model of one's own: installed as a plugin, listed, trained and evaluated by the commands."""
 
-import json
-import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
+from installed import command, install
 
 from m3gn_bench.data import load_cases
 from m3gn_bench.evaluation import evaluate_model
@@ -22,38 +17,8 @@ NAME = "damped_velocity"
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """An environment in which the example is installed, outside the one that runs the tests, without network."""
-    source, target = tmp_path_factory.mktemp("source") / "own_model", tmp_path_factory.mktemp("target")
-    shutil.copytree(EXAMPLE, source)  # building leaves files beside what is built
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-index",
-        "--no-deps",
-        "--no-build-isolation",
-    ]
-    done = subprocess.run(
-        [*pip, "--target", str(target), str(source)], capture_output=True, text=True, timeout=900
-    )
-    assert done.returncode == 0, done.stderr
-    return os.environ | {"PYTHONPATH": str(target)}
-
-
-def command(environment: dict[str, str], *arguments: object) -> dict[str, Any]:
-    """What a command says in JSON."""
-    script = Path(sys.executable).with_name("m3gn-bench")
-    done = subprocess.run(
-        [str(script), *map(str, arguments), "--json"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr
-    return dict(json.loads(done.stdout))
+    """An environment in which the example is installed."""
+    return install(EXAMPLE, tmp_path_factory.mktemp("own_model"))
 
 
 def test_is_listed_for_every_task(environment: dict[str, str]) -> None:
