@@ -23,6 +23,7 @@ from m3gn_bench.generators.solvers.tetrahedra import Element
 TEDDY = FallingTeddy()
 DEFAULT = TEDDY.fidelities["default"]
 COURANT = DEFAULT.courant
+UNDAMPED = 0.7  # of the limit of stability
 IMPACT = falling.flight_frames(falling.HEIGHT)  # first frame after contact
 SOON, LATER = IMPACT + 10, IMPACT + 20  # 0.1 and 0.2 s after it
 
@@ -47,7 +48,7 @@ def distance(one: np.ndarray, other: np.ndarray, frame: int) -> float:
 
 @pytest.mark.parametrize("poisson_ratio", [0.0, 0.3, 0.49, 0.499])
 def test_convergence_in_time(poisson_ratio: float) -> None:
-    """0.2 s after the impact the default step's error is below 0.5 % of the size, and falls with the step.
+    """0.2 s after the impact the default step's error is below 0.05 % of the size, and falls with the step.
 
     First order: the floor's impulse and the viscosity's lag, not leapfrog's second order, set the rate.
     """
@@ -56,7 +57,7 @@ def test_convergence_in_time(poisson_ratio: float) -> None:
     errors = [distance(positions(parameters, 0.7 / k), finest, LATER) for k in (1, 2, 4)]
     default = distance(positions(parameters, COURANT), finest, LATER)
     print(f"nu {poisson_ratio}: {default:.1e}; " + ", ".join(f"{error:.1e}" for error in errors))
-    assert max(default, errors[0]) < 5e-3
+    assert max(default, errors[0]) < 5e-4
     # A step of 1/k against 1/8 of it: first order gives the ratios 7/3 and 3.
     assert errors[0] > 1.8 * errors[1] > 1.8 * 2 * errors[2]
 
@@ -90,7 +91,8 @@ def test_rounding_is_harmless() -> None:
 def test_energy_of_a_free_teddy(youngs_modulus: float, poisson_ratio: float) -> None:
     """No viscosity, no contact, half of the energy exchanged: leapfrog keeps it up to a bounded oscillation.
 
-    That goes with the square of the step.
+    That goes with the square of the step. Without viscosity the default step (0.85 of the limit) is too long for the
+    stiffer of the two: stretched cells ask for a shorter one, and it diverges, which is seen and said.
     """
     body = load_object("teddy")
     solid = explicit.ExplicitSolid(
@@ -106,7 +108,7 @@ def test_energy_of_a_free_teddy(youngs_modulus: float, poisson_ratio: float) -> 
     start = solid.vertices + 0.05 * np.stack([np.sin(4 * y + 2 * z), 4 * x * z, np.cos(3 * x) * y], axis=1)
     spin = np.cross([0.5, 1.0, -2.0], start) + np.array([1.0, 0.0, 0.3])
     lost = {}
-    for courant in (COURANT, COURANT / 4):
+    for courant in (UNDAMPED, UNDAMPED / 4):
         substeps = solid.substeps(FRAME_TIME, courant)
         motion = solid.run(start, spin, frames=100, frame_time=FRAME_TIME, substeps=substeps)
         energies, _ = solid.monitor(motion)
@@ -118,8 +120,8 @@ def test_energy_of_a_free_teddy(youngs_modulus: float, poisson_ratio: float) -> 
             f"E {youngs_modulus:g}, nu {poisson_ratio}, courant {courant}, {substeps} steps: {lost[courant]:.1e}"
         )
         assert np.ptp(energies[:, 1]) > 0.1 * total[0]
-    assert lost[COURANT / 4] < 2e-3
-    assert lost[COURANT] < 5e-3
+    assert lost[UNDAMPED / 4] < 1e-3
+    assert lost[UNDAMPED] < 5e-3
 
 
 EXTREMES = {
@@ -128,6 +130,7 @@ EXTREMES = {
     "stiffest, compressible": {"youngs_modulus": 1e6, "poisson_ratio": 0.0},
     "beyond: nu 0.4999": {"youngs_modulus": 2e5, "poisson_ratio": 0.4999},
     "beyond: E / 10": {"youngs_modulus": 1e4, "poisson_ratio": 0.3},
+    "beyond: E / 100": {"youngs_modulus": 1e3, "poisson_ratio": 0.3},
     "beyond: E x 10": {"youngs_modulus": 1e7, "poisson_ratio": 0.3},
     "beyond: from 2 m": {"height": 2.0, "youngs_modulus": 3e5, "poisson_ratio": 0.3},
     "beyond: from rest on the floor": {"height": 0.0, "youngs_modulus": 3e5, "poisson_ratio": 0.3},
@@ -149,7 +152,7 @@ def test_extremes(name: str) -> None:
     print(f"{name}: {problems or 'valid'} {trajectory.diagnostics}")
     assert np.isfinite(trajectory.positions).all()
     assert trajectory.positions[..., 2].min() >= 0
-    if name != "beyond: E / 10":  # so soft that it does not carry its own weight: parts stay inside out
+    if name != "beyond: E / 100":  # so soft that it does not carry its own weight: parts stay inside out
         assert problems == []
     else:
         assert problems
@@ -175,10 +178,10 @@ def test_random_drops_are_valid() -> None:
 
 
 @pytest.mark.parametrize(
-    ("term", "smallest_effect"), [("FRICTION", 0.1), ("VISCOSITY", 0.02), ("nodal pressure", 0.02)]
+    ("term", "smallest_effect"), [("FRICTION", 0.05), ("VISCOSITY", 0.005), ("nodal pressure", 0.005)]
 )
 def test_every_term_matters(monkeypatch: pytest.MonkeyPatch, term: str, smallest_effect: float) -> None:
-    """Switched off, each changes the motion by far more than the step does (5e-3 at most, see above)."""
+    """Switched off, each changes the motion by far more than the step does (5e-4 at most, see above)."""
     parameters, level = teddy(2), DEFAULT
     usual = positions(parameters, DEFAULT.courant)
     if term == "nodal pressure":
