@@ -13,6 +13,7 @@ whatever their number:
   validation is. It alone writes.
 """
 
+import importlib
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -114,8 +115,8 @@ class Group:
         state = zlib.crc32(repr(rng.bit_generator.state).encode())
         if self.total(state) != state * self.size:
             raise TrainingError(
-                "processes no longer draw the same random numbers: either they do not see the same folder of the run, or "
-                "the model draws for nodes or bodies by itself instead of with Body.drawn_per_node (see docs/scale.md)"
+                "processes no longer draw the same random numbers: either they do not see the same folder of the run, "
+                "or the model draws for nodes by itself instead of with Body.drawn_per_node (see docs/scale.md)"
             )
 
 
@@ -136,6 +137,9 @@ def torchrun_group(device: str) -> Iterator[Group]:
     if size == 1:
         yield ALONE
         return
+    # Functions in there have the group that exists when they are loaded as a default argument. Optimisers load them,
+    # and then ours would outlive its end, and its threads the interpreter.
+    importlib.import_module("torch.distributed.nn.functional")
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"several processes share the work on --device cpu or cuda, not {device}")
     own = torch.device("cpu") if device == "cpu" else torch.device("cuda", int(os.environ["LOCAL_RANK"]))

@@ -3,10 +3,12 @@
 import json
 import os
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from model_cases import make_case
 
 import m3gn_bench.training
@@ -46,6 +48,7 @@ def training(name: str, out: Path, group: Group = ALONE, kill_at: int | None = N
 def main(out: Path, what: str) -> None:
     torch.set_num_threads(1)
     with torchrun_group("cpu") as group:
+        connection = weakref.ref(dist.group.WORLD)
         if what == "die":
             m3gn_bench.training.SAVE_INTERVAL = 0.0
             training(MODELS[0], out, group, kill_at=STEPS - 2)
@@ -56,7 +59,8 @@ def main(out: Path, what: str) -> None:
             group.require_same(np.random.default_rng(group.rank))
         except TrainingError:
             refused = True
-        (out / f"{group.rank}.json").write_text(json.dumps({"size": group.size, "refused": refused}))
+    found = {"size": group.size, "refused": refused, "ended": connection() is None}
+    (out / f"{group.rank}.json").write_text(json.dumps(found))
 
 
 if __name__ == "__main__":

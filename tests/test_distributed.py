@@ -134,7 +134,8 @@ def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
         done = torchrun(script, folders[what], "train")
         assert done.returncode == 0, done.stderr
         for rank in range(2):
-            assert json.loads((folders[what] / f"{rank}.json").read_text()) == {"size": 2, "refused": True}
+            found = json.loads((folders[what] / f"{rank}.json").read_text())
+            assert found == {"size": 2, "refused": True, "ended": True}
 
     for name in MODELS:
         alone, together, resumed = (weights(folder / name) for folder in folders.values())
