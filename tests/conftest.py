@@ -2,7 +2,8 @@
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side, one in each process (before numpy is loaded)
+# Tests run side by side, one in each process; this counts if it is said before numpy is loaded.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import zlib
 from collections.abc import Callable
