@@ -364,7 +364,7 @@ def campaign(
         records = read_records(home)
         states = [run.state(records, versions[run.task]) for run in planned]
     counts = {state: states.count(state) for state in ("done", "outdated", "to do")}
-    rows = [
+    rows: list[list[object]] = [
         [run.task, run.name, state]
         for run, state in zip(planned, states, strict=True)
         if state != "done" or not status
