@@ -74,7 +74,7 @@ def draw_overlays(
             axes.auto_scale_xyz(*np.concatenate([truth, predicted]).T)
         else:
             axes = figure.add_subplot(rows, columns, place)
-            axes.add_collection(PolyCollection(predicted[triangles], facecolors=faces))
+            axes.add_collection(PolyCollection(list(predicted[triangles]), facecolors=faces))
             axes.add_collection(LineCollection(truth[edges], colors="0.2", linewidths=0.4))
             axes.autoscale()
         axes.set(title=name, aspect="equal")
@@ -110,7 +110,7 @@ def draw_latents(model: M3GN, cases: Sequence[Case], context: int) -> "Figure":
     figure.suptitle(f"{model.task.title}: task descriptions after {context} frames")
     for number, name in enumerate(names):
         axes = figure.add_subplot(1, len(names), number + 1)
-        shown = axes.scatter(*places.T, c=materials[:, number], cmap="viridis", s=14)
+        shown = axes.scatter(places[:, 0], places[:, 1], c=materials[:, number], cmap="viridis", s=14)
         figure.colorbar(shown, label=f"{name}, scaled")
         axes.set(xticks=[], yticks=[])
     return figure
