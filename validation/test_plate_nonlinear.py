@@ -168,12 +168,13 @@ def _smallest_eigenvalue(plate: ClampedPlate, x: Array) -> float:
     return 1 / float(np.linalg.norm(vector))
 
 
-@pytest.mark.parametrize(("fidelity", "allowed"), [("fast", 1e-3), ("default", 1e-5)])
+@pytest.mark.parametrize(("fidelity", "allowed"), [("fast", 1e-3), ("default", 1e-4)])
 @pytest.mark.parametrize("youngs_modulus", [10.0, 100.0, 1000.0])
 def test_newtons_tolerance_is_small_enough(youngs_modulus: float, fidelity: Fidelity, allowed: float) -> None:
-    """`fast` is within 0.1 % of tightly converged states on its mesh, `default` within 0.001 %.
+    """`fast` is within 0.1 % of tightly converged states on its mesh, `default` within 0.01 %.
 
-    So what `default` leaves undone is less than a tenth of the smallest error that its mesh makes (0.02 %).
+    So what `default` leaves undone is less than half of the smallest error that its mesh makes (0.02 %); a tenth of that
+    takes a fifth more time (dataset version 1.0).
     """
     parameters = case(youngs_modulus, SAME)
     tight = displacements_with(parameters, replace(SheetDeformation.fidelities[fidelity], tolerance=1e-9))
