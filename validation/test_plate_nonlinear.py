@@ -173,8 +173,8 @@ def _smallest_eigenvalue(plate: ClampedPlate, x: Array) -> float:
 def test_newtons_tolerance_is_small_enough(youngs_modulus: float, fidelity: Fidelity, allowed: float) -> None:
     """`fast` is within 0.1 % of tightly converged states on its mesh, `default` within 0.01 %.
 
-    So what `default` leaves undone is less than half of the smallest error that its mesh makes (0.02 %); a tenth of that
-    takes a fifth more time (dataset version 1.0).
+    So what `default` leaves undone is less than half of the smallest error that its mesh makes (0.02 %); a tenth of
+    that takes a fifth more time (dataset version 1.0).
     """
     parameters = case(youngs_modulus, SAME)
     tight = displacements_with(parameters, replace(SheetDeformation.fidelities[fidelity], tolerance=1e-9))
