@@ -28,7 +28,7 @@ STYLES = {
 def draw_board(records: Sequence[ResultRecord], track: str, task: str) -> "Figure | None":
     """Error over the number of context frames, and over time at the middle one; None if there is nothing to show.
 
-    Bars and bands are 95 % intervals over seeds and trajectories; models without a style of their own are left out.
+    Bars are 95 % intervals over seeds and trajectories; models without a style of their own are left out.
     """
     from matplotlib.figure import Figure
 

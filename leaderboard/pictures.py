@@ -7,12 +7,13 @@ import numpy as np
 import torch
 
 from m3gn_bench.checkpoint import load_checkpoint
-from m3gn_bench.data import Case, load_cases, mesh_edges
+from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder
 from m3gn_bench.leaderboard.summary import middle
 from m3gn_bench.m3gn import M3GN
+from m3gn_bench.picture_geometry import surface, wireframe
 from m3gn_bench.tasks import Task
 
 if TYPE_CHECKING:
@@ -41,14 +42,15 @@ def draw_overlays(
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     context = middle(task.context_sizes)
-    errors = next(r for r in records if r.model == "m3gn").result(context)
+    judge = next(record for record in records if record.model == "m3gn")
+    errors = judge.result(context)
     assert errors is not None
-    chosen = int(np.argsort(errors.trajectory_mse)[len(errors.trajectory_mse) // 2])
-    key = next(r for r in records if r.model == "m3gn").keys[chosen]
+    key = judge.keys[int(np.argsort(errors.trajectory_mse)[len(errors.trajectory_mse) // 2])]
     source = TrajectoryDataset(dataset, task.name, "test", tier)
-    triangles = source[source.keys.index(key)].mesh.cells
-    edges = mesh_edges(triangles).T
-    case = next(c for c in load_cases(dataset, task, "test", tier) if c.keys == (key,))
+    trajectory = source[source.keys.index(key)]
+    case = case_from(task, source.metadata, trajectory, key)
+    triangles = surface(trajectory.mesh)
+    edges = wireframe(triangles)
 
     truth = case.positions[-1].numpy()
     predictions = {}

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from m3gn_bench.leaderboard.figures import STYLES
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_of_less, titles
+from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_below, titles
 
 FIGURES = "figures"  # the folder beside the page
 
@@ -25,18 +25,23 @@ TRACKS = {
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, for as long as one core allowed ([plan](plans/paper.toml)): "
     "not the paper's training, which took days on a GPU.",
-    "tuning": "Trials of learning rates, on the *validation* split ([plan](plans/tuning.toml)); each method's best "
-    "is in its compact preset.",
+    "tuning": "Trials of learning rates for the compact presets, on the *validation* split "
+    "([plan](plans/tuning.toml)).",
     "smoke": "A few steps on a few trajectories, which `m3gn-bench leaderboard check` trains again "
     "([plan](plans/smoke.toml)). Says nothing about the models.",
 }
 
 
+def tracks_of(records: Sequence[ResultRecord]) -> list[str]:
+    """The tracks that have records, known ones first."""
+    found = {record.track for record in records}
+    return [name for name in TRACKS if name in found] + sorted(found - set(TRACKS))
+
+
 def render(records: Sequence[ResultRecord]) -> str:
     """The whole page."""
     parts = [HEADER]
-    found = {record.track for record in records}
-    for track in [name for name in TRACKS if name in found] + sorted(found - set(TRACKS)):
+    for track in tracks_of(records):
         parts.append(f"## Track: {track}\n\n{TRACKS.get(track, '')}\n")
         for name, title in titles(records).items():
             rows = entries(records, track, name)
@@ -114,8 +119,8 @@ def _cells(row: Entry, contexts: Sequence[int], m3gn: Entry | None) -> Iterable[
             continue
         error = row.estimate(context)
         yield f"{_micro(error.mean)} [{_micro(error.low)}, {_micro(error.high)}]"
-    comparable = m3gn is not None and m3gn is not row and m3gn.records[0].keys == row.records[0].keys
-    yield f"{probability_of_less(row, m3gn, middle(contexts)):.3f}" if m3gn and comparable else ""
+    probability = probability_below(row, m3gn, middle(contexts))
+    yield "" if probability is None else f"{probability:.3f}"
 
 
 def _row(cells: Iterable[str]) -> str:

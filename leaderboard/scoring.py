@@ -46,17 +46,16 @@ def score(
         BenchError: predictions that are not finite.
     """
     with open_file(dataset) as file:
-        task = task_of_data(read_description(checkpoint).task, read_metadata(file))
+        metadata = read_metadata(file)
+        dataset_hash = content_hash(file, tier, (split,))
+        hashes = stored_hashes(file)
+    task = task_of_data(read_description(checkpoint).task, metadata)
     model, described = load_checkpoint(checkpoint, task)
     cases = load_cases(dataset, task, split, tier, materials)
     start = time.perf_counter()
     errors = evaluate_model(model, cases, contexts or task.context_sizes, on_progress)
     seconds = time.perf_counter() - start
     keys = tuple(case.keys[0] for case in cases)
-    with open_file(dataset) as file:
-        dataset_version = read_metadata(file).dataset_version
-        dataset_hash = content_hash(file, tier, (split,))
-        hashes = stored_hashes(file)
     return ResultRecord(
         track=track,
         task=task.name,
@@ -68,7 +67,7 @@ def score(
         parameters=model.parameter_count(),
         tier=tier,
         split=split,
-        dataset_version=dataset_version,
+        dataset_version=metadata.dataset_version,
         dataset_hash=dataset_hash,
         keys=keys,
         trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),

@@ -115,6 +115,15 @@ def probability_of_less(
     return float(np.mean(ours < theirs) + 0.5 * np.mean(ours == theirs))
 
 
+def probability_below(row: Entry, yardstick: Entry | None, context: int) -> float | None:
+    """`probability_of_less` against the row that others are measured by; None where that cannot be said."""
+    if yardstick is None or yardstick is row or context not in yardstick.contexts:
+        return None
+    if yardstick.records[0].keys != row.records[0].keys:
+        return None
+    return probability_of_less(row, yardstick, context)
+
+
 def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entry]:
     """The rows of a board, best error at the middle context size first."""
     groups: dict[tuple[str, str, str], list[ResultRecord]] = {}

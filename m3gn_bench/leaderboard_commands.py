@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from m3gn_bench.leaderboard.record import ResultRecord
 
 
+BOARD = click.option(
+    "--home",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="The leaderboard's folder, where records go (in a checkout: leaderboard).",
+)
+
+
 @click.group()
 def leaderboard() -> None:
     """Show the leaderboard, make its tables, re-derive its numbers."""
@@ -223,6 +231,8 @@ def check_command(
     left = len(records) - runs(outcome.compared)
     if left:
         lines.append(f"{left} records can only be re-derived by training: see the plans in leaderboard/plans")
+    if not outcome.compared and not outcome.problems:
+        lines.append("there is nothing to compare: no record has a checkpoint here, or is of track smoke")
     lines.append("every sampled number was re-derived" if outcome.ok else "the leaderboard does NOT hold")
     report.finish(outcome.model_dump(mode="json"), "\n".join(lines))
     sys.exit(0 if outcome.ok else 1)
@@ -256,12 +266,7 @@ def _train_again(
 
 @leaderboard.command()
 @click.argument("record", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--home",
-    type=click.Path(path_type=Path, file_okay=False),
-    required=True,
-    help="The leaderboard's folder (in a checkout: leaderboard).",
-)
+@BOARD
 @click.option("--replace", is_flag=True, help="Replace the record of the same name.")
 @JSON
 def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
@@ -286,12 +291,7 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
 
 @click.command()
 @click.argument("plan", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--home",
-    type=click.Path(path_type=Path, file_okay=False),
-    required=True,
-    help="Where records go (in a checkout: leaderboard).",
-)
+@BOARD
 @click.option(
     "--runs",
     type=click.Path(path_type=Path, file_okay=False),

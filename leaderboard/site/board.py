@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.render import TRACKS
-from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_of_less
+from m3gn_bench.leaderboard.render import tracks_of
+from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_below
 from m3gn_bench.tasks import TASKS
 
 TINY = 1e-30  # an error of zero has no place on a logarithmic scale
@@ -53,12 +53,6 @@ def digits(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
 
 
-def tracks_of(records: Sequence[ResultRecord]) -> list[str]:
-    """The tracks that have records, known ones first."""
-    found = {record.track for record in records}
-    return [name for name in TRACKS if name in found] + sorted(found - set(TRACKS))
-
-
 def board_rows(
     records: Sequence[ResultRecord], on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> list[Row]:
@@ -99,12 +93,6 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
 
 
 def _row(track: str, task: str, context: int, entry: Entry, m3gn: Entry | None) -> Row:
-    comparable = (
-        m3gn is not None
-        and m3gn is not entry
-        and context in m3gn.contexts
-        and m3gn.records[0].keys == entry.records[0].keys
-    )
     return Row(
         track=track,
         task=task,
@@ -112,7 +100,7 @@ def _row(track: str, task: str, context: int, entry: Entry, m3gn: Entry | None) 
         entry=entry,
         mse=entry.estimate(context),
         mse_free_nodes=float(entry.errors(context, free_nodes=True).mean()),
-        probability=probability_of_less(entry, m3gn, context) if m3gn and comparable else None,
+        probability=probability_below(entry, m3gn, context),
     )
 
 
