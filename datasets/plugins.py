@@ -14,6 +14,7 @@ from m3gn_bench.datasets.errors import BenchError
 
 Kind = Literal["scene", "task", "model"]
 T = TypeVar("T")
+DISTRIBUTION = "m3gn-bench"  # this package, among those that have entry points
 
 
 class PluginError(BenchError):
@@ -22,16 +23,25 @@ class PluginError(BenchError):
 
 @cache  # looking through all installed packages takes milliseconds
 def plugins(kind: Kind) -> dict[str, EntryPoint]:
-    """Entry points of the group `m3gn_bench.<kind>s` by name; our own models are among those of models."""
+    """Entry points of the group `m3gn_bench.<kind>s` by name; our own models are among those of models.
+
+    The first package that takes a name has it, and we come first; says which others are left out.
+    """
     found: dict[str, EntryPoint] = {}
-    for entry in entry_points(group=f"m3gn_bench.{kind}s"):
-        found.setdefault(entry.name, entry)
+    for entry in sorted(entry_points(group=f"m3gn_bench.{kind}s"), key=lambda e: _package(e) != DISTRIBUTION):
+        if entry.name in found:
+            _leave_out_taken(kind, entry)
+        else:
+            found[entry.name] = entry
     return found
 
 
 def package_of(kind: Kind, name: str) -> str:
     """The package that adds what bears that name, or where its code is if that is all one knows."""
-    entry = plugins(kind)[name]
+    return _package(plugins(kind)[name])
+
+
+def _package(entry: EntryPoint) -> str:
     return entry.dist.name if entry.dist else entry.value
 
 
@@ -63,6 +73,10 @@ def leave_out(reason: str) -> None:
     logging.getLogger(__name__).warning("warning: left out: %s", reason)
 
 
+def _leave_out_taken(kind: Kind, entry: EntryPoint) -> None:
+    leave_out(f"{kind} {entry.name!r} of the package {_package(entry)}: the name is taken")
+
+
 def usable(kind: Kind, get: Callable[[str], T], own: Container[str] = ()) -> Iterator[tuple[str, T]]:
     """Name and object of every entry point that can be used; says which are left out.
 
@@ -71,9 +85,9 @@ def usable(kind: Kind, get: Callable[[str], T], own: Container[str] = ()) -> Ite
         get: gives what bears a name, or raises PluginError.
         own: names that are ours, which no package may take.
     """
-    for name in plugins(kind):
+    for name, entry in plugins(kind).items():
         if name in own:
-            leave_out(f"{kind} {name!r} of the package {package_of(kind, name)}: the name is taken")
+            _leave_out_taken(kind, entry)
             continue
         try:
             found = get(name)

@@ -278,6 +278,21 @@ def test_a_name_of_ours_is_taken(add: Add, caplog: pytest.LogCaptureFixture) -> 
         TASKS["other"]
 
 
+def test_a_model_of_ours_is_not_replaced(add: Add, caplog: pytest.LogCaptureFixture) -> None:
+    """Packages whose place on the path is before ours; and of two others that take the same name, one has it."""
+    ours, packages = model.get_model_class("mgn"), {"taker-one", "taker-two"}
+    for name in ("taker_one", "taker_two"):
+        add(name, "class X: ...", model=f"mgn = {name}:X\nshared = {name}:X")
+    assert model.get_model_class("mgn") is ours
+    left_out = {("mgn", package) for package in packages}
+    left_out |= {("shared", package) for package in packages - {plugins.package_of("model", "shared")}}
+    assert len(left_out) == 3
+    assert sorted(caplog.messages) == sorted(
+        f"warning: left out: model '{name}' of the package {package}: the name is taken"
+        for name, package in left_out
+    )
+
+
 def test_is_short() -> None:
     """Fewer than 80 lines of code, as promised."""
     lines = (EXAMPLE / "own_task.py").read_text().splitlines()
