@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.schema import (
     FORMAT,
     SCHEMA_VERSION,
@@ -20,7 +20,6 @@ from m3gn_bench.datasets.schema import (
     in_tier,
     parse_key,
     tier_sizes,
-    trajectory_key,
 )
 from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
 
@@ -118,11 +117,17 @@ def _array(group: h5py.Group, name: str) -> np.ndarray:
     dataset = group[name]
     if dataset.chunks not in (None, dataset.shape):
         raise ValueError(f"{name} of shape {dataset.shape} has chunks {dataset.chunks}")
-    if dataset.nbytes > MAX_COMPRESSION * dataset.id.get_storage_size():
-        raise ValueError(
-            f"{name} of shape {dataset.shape} has {dataset.id.get_storage_size()} bytes in the file"
-        )
+    require_stored(dataset)
     return dataset[()]
+
+
+def require_stored(dataset: h5py.Dataset) -> None:
+    """Raise ValueError unless the numbers of an array are in its own file, as many as it says."""
+    if dataset.external or dataset.is_virtual:
+        raise ValueError(f"{dataset.name} is kept in another file")
+    stored = dataset.id.get_storage_size()
+    if dataset.nbytes > MAX_COMPRESSION * stored:
+        raise ValueError(f"{dataset.name} of shape {dataset.shape} has {stored} bytes in the file")
 
 
 @contextmanager
@@ -149,21 +154,32 @@ def read_splits(file: h5py.File) -> dict[str, dict[str, list[str]]]:
         }
 
 
-def find_key(file: h5py.File, split: str, index: int) -> str:
-    """The key of a trajectory. Raises DatasetError with what there is instead."""
-    wanted, keys = as_split(split), list(stored_hashes(file))
-    count = sum(parse_key(key)[0] == wanted for key in keys)
-    if not count:
-        present = sorted({parse_key(key)[0] for key in keys})
+def find_key(file: h5py.File, split: str, index: int, task: str | None = None) -> str:
+    """The key of a trajectory of a split: of a task's, or without one of all that the file holds.
+
+    Raises:
+        DatasetError: there is none; says what there is instead.
+    """
+    listed: dict[str, list[str]] = {}
+    if task is None:
+        for key in stored_hashes(file):
+            listed.setdefault(parse_key(key)[0], []).append(key)
+    else:
+        tasks = read_splits(file)
+        if task not in tasks:
+            raise DatasetError(f"{file.filename}: {unknown_name('task', task, list(tasks))}")
+        listed = tasks[task]
+    keys = listed.get(as_split(split), [])
+    of_task = f" of task {task}" if task else ""
+    if not keys:
+        present = " and ".join(sorted(listed)) or "none"
+        raise DatasetError(f"{file.filename} has no {split} trajectories{of_task}; it has {present}")
+    if not 0 <= index < len(keys):
         raise DatasetError(
-            f"{file.filename} has no {split} trajectories; it has {' and '.join(present) or 'none'}"
+            f"index {index} is out of range: {file.filename} has {len(keys)} {split} trajectories{of_task}, "
+            f"0 to {len(keys) - 1}"
         )
-    key = trajectory_key(split, index)
-    if key not in keys:
-        raise DatasetError(
-            f"index {index} is out of range: {file.filename} has {count} {split} trajectories, 0 to {count - 1}"
-        )
-    return key
+    return keys[index]
 
 
 def content_hash(file: h5py.File, tier: str | None = None, splits: Sequence[str] = SPLITS) -> str:

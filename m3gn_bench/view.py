@@ -102,7 +102,7 @@ def view(
     Args:
         file: the dataset file.
         out: the picture; a .png shows the frames side by side, a .gif or .mp4 one after the other.
-        split, index: which trajectory.
+        split, index: which trajectory; where there are models, of their task's split.
         frames: a number of evenly spaced frames, or a list such as "0,10,20"; None for 6 of them in a .png
             (4 where there are models) and all in an animation.
         fps: frames per second of an animation.
@@ -140,7 +140,7 @@ def view(
 
     with open_file(file) as opened:
         metadata = read_metadata(opened)
-        key = find_key(opened, split, index)
+        key = find_key(opened, split, index, comparison.task if comparison else None)
         trajectory = read_trajectory(opened, key)
     _require_drawable(trajectory, f"{file}: trajectory {key}")
     count = len(trajectory.positions)
@@ -152,8 +152,6 @@ def view(
         from m3gn_bench.predictions import predict  # needs torch
 
         task = task_of_data(comparison.task, metadata)
-        if task.scene != metadata.scene:
-            raise ConfigError(f"task {task.name} is of scene {task.scene}, but {file} holds {metadata.scene}")
         middle = task.context_sizes[len(task.context_sizes) // 2]
         context = middle if comparison.context is None else comparison.context
         predictions = predict(comparison.checkpoints, task, context, trajectory, key, metadata)

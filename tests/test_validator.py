@@ -112,6 +112,11 @@ FILE_DEFECTS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         GROUP,
         store_otherwise(f"{GROUP}/positions", shape=(10**6, 10**6, 3), dtype="<f4"),
     ),
+    "numbers of another file": (
+        "E003",
+        GROUP,
+        store_otherwise(f"{GROUP}/positions", shape=(4, 5, 3), dtype="<f4", external=[(__file__, 0, 240)]),
+    ),
     "other chunks": ("E003", GROUP, store_otherwise(f"{GROUP}/positions", chunks=(1, 5, 3))),
     "positions in float64": ("E004", GROUP, replace_array(f"{GROUP}/positions", np.float64)),
     "collider edges in int64": ("E004", GROUP, replace_array(f"{GROUP}/collider_edges", np.int64)),

@@ -585,7 +585,7 @@ def test_errors(
         (["--model", "mango"], "(there are m3gn, mgn, stand_still); train one and pass --checkpoint"),
         (["--model", "mgn", "--task", "sheet_deformation_ood"], "no checkpoint of mgn on sheet_deformation_ood ships"),
         (["--checkpoint", "{mgn}", "--task", "sheet_deformation_ood"], "was trained on sheet_deformation, not on"),
-        (["--checkpoint", "{mgn}", "--task", "deformable_block"], "is of scene deformable_block, but"),
+        (["--checkpoint", "{mgn}", "--task", "deformable_block"], "unknown task 'deformable_block'; known: sheet_"),
         (["--model", "mgn", "--context", "51"], "context size 51 is out of range"),
         (["--model", "mgn", "--context", "1"], "context size 1 is out of range"),
         (["--checkpoint", "{empty}"], "no checkpoint in"),
@@ -625,6 +625,28 @@ def test_runs_beside_models_that_ship(
         f"mgn, {run_folder}",
         "stand_still",
     ]
+
+
+@pytest.mark.parametrize(("split", "keys"), [("test", [0, 1]), ("validation", [2, 3])])
+def test_a_task_s_trajectories_are_those_of_its_split(
+    shipped: Path,
+    smoke_file: Path,
+    tmp_path: Path,
+    split: str,
+    keys: list[int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Those of Young's moduli 10 and 30 are in one task's test set alone, and counted there."""
+    still, out = tmp_path / "still", tmp_path / "x.png"
+    shutil.copytree(checkpoint_folder("sheet_deformation", "stand_still", "compact", home=shipped), still)
+    described = json.loads((still / "checkpoint.json").read_text())
+    (still / "checkpoint.json").write_text(json.dumps({**described, "task": "sheet_deformation_ood"}))
+    arguments = ["--checkpoint", still, "--split", split, "--frames", 1, "-o", out]
+    for index, number in enumerate(keys):
+        assert view(smoke_file, *arguments, "--index", index, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["trajectory"] == f"{split}_{number:05d}"
+    assert view(smoke_file, *arguments, "--index", 2) == 2
+    assert f"has 2 {split} trajectories of task sheet_deformation_ood, 0 to 1" in capsys.readouterr().err
 
 
 def test_a_model_that_diverges(
