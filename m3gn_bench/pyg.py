@@ -1,5 +1,6 @@
 """Trajectories as graphs of PyTorch Geometric."""
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from m3gn_bench.datasets.exports.parts import frame_times
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import VTK_TRIANGLE, Trajectory
-from m3gn_bench.datasets.writer import atomic_path
+from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def export_pyg(file: Path, key: str, out: Path) -> list[Path]:
     """
     with open_file(file) as opened:
         graph = to_pyg(read_trajectory(opened, key), read_metadata(opened))
-    with atomic_path(out) as temporary:
-        torch.save(graph.to_dict(), temporary)
+    buffer = io.BytesIO()  # given a path that it cannot write, torch raises no OSError
+    torch.save(graph.to_dict(), buffer)
+    write_bytes_atomically(out, buffer.getvalue())
     return [out]

@@ -121,8 +121,9 @@ def test_vtk_steps_through_a_trajectory(files: dict[str, Path], kind: str, tmp_p
     collider = tmp_path / "x-collider.vtkhdf"
     assert collider.exists() == (trajectory.collider_positions is not None)
     if trajectory.collider_positions is not None:
-        for positions, (_, grid) in zip(trajectory.collider_positions, steps_of(collider), strict=False):
-            np.testing.assert_array_equal(grid.points, in_space(positions))
+        for frame, (time, grid) in zip([*range(metadata.frames), 0], steps_of(collider), strict=True):
+            assert time == pytest.approx(frame * metadata.dt)
+            np.testing.assert_array_equal(grid.points, in_space(trajectory.collider_positions[frame]))
             edges = trajectory.collider_edges
             np.testing.assert_array_equal(cell_nodes(grid), [[0], [1]] if edges is None else edges)
 
@@ -448,6 +449,36 @@ def test_trajectories_of_different_arrays_are_refused(write_tetra: TetraWriter, 
 
 
 @needs_hub
+def test_damaged_rows_are_not_handed_on(tetra_file: Path, tmp_path: Path) -> None:
+    file = Path(shutil.copy(tetra_file, tmp_path))
+    with h5py.File(file, "r+") as opened:
+        opened["trajectories/test_00000/positions"][2, 1] += 1
+    made = python(EXPORT, tmp_path, "export", file, "--format", "huggingface")
+    assert made.returncode == 2
+    assert "test_00000 does not match its content hash" in made.stderr
+    assert [path for path in tmp_path.iterdir() if path.name != ".home"] == [file]
+
+
+@needs_hub
+def test_the_current_folder_stays(tetra_file: Path, tmp_path: Path) -> None:
+    made = python(EXPORT, tmp_path, "export", tetra_file, "--format", "huggingface", "-o", ".")
+    assert (made.returncode, made.stderr) == (2, "error: . is there already; use another folder\n")
+
+
+@needs_hub
+def test_the_licence_of_others_is_no_name_of_the_hub_s(
+    write_tetra: TetraWriter, tetra_metadata: Metadata, tmp_path: Path
+) -> None:
+    changes = {"variant": {"imported": "ggns"}, "licence": "that of the source"}
+    metadata = tetra_metadata.model_copy(update=changes)
+    file = write_tetra(tmp_path / "tetra.h5", metadata=metadata, only={KEY})
+    assert python(EXPORT, tmp_path, "export", file, "--format", "huggingface", "-o", "out").returncode == 0
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "\nlicense: other\n" in card
+    assert "| licence | that of the source |" in card
+
+
+@needs_hub
 def test_our_folder_may_not_stand_for_the_library(tetra_file: Path, tmp_path: Path) -> None:
     program = f"import os; os.chdir({str(ROOT)!r}); {EXPORT}"
     made = python(program, tmp_path, "export", tetra_file, "--format", "huggingface", "-o", tmp_path / "out")
@@ -494,6 +525,7 @@ def test_files_stand_beside_the_dataset(
         (["--format", "xdmf", "-o", "{colon}"], "a path with a colon; rename it, or use vtkhdf"),
         (["--format", "huggingface", "--index", "0"], "leave out --split and --index"),
         (["--format", "npz", "-o", "{file}/x.npz"], "x.npz"),
+        (["--format", "pyg", "-o", "/proc/x.pt"], "cannot write /proc/x.pt"),
     ],
 )
 def test_refusals(

@@ -166,7 +166,8 @@ def _new_folder(path: Path) -> Iterator[Path]:
     Raises:
         DatasetError: `path` is there already, or the operating system refuses.
     """
-    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+    # The current folder cannot be replaced under the feet of whoever is in it.
+    if path.is_file() or (path.is_dir() and (path.samefile(".") or any(path.iterdir()))):
         raise DatasetError(f"{path} is there already; use another folder")
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -186,7 +187,7 @@ def _card(metadata: Metadata, info: Any) -> str:
     from datasets.info import DatasetInfosDict
 
     header = DatasetCardData(
-        license=metadata.licence.lower(),
+        license="other" if metadata.is_imported else metadata.licence.lower(),  # identifiers of the hub
         pretty_name=f"m3gn-bench {metadata.scene}",
         tags=["physics", "simulation", "mesh", "deformable objects"],
         configs=[

@@ -44,7 +44,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Source:
+class Located:
     """One trajectory of a dataset file, its content verified.
 
     Attributes:
@@ -71,7 +71,7 @@ def frame_times(metadata: Metadata) -> np.ndarray:
     return metadata.dt * np.arange(metadata.frames)
 
 
-def read_source(file: Path, key: str) -> Source:
+def read_located(file: Path, key: str) -> Located:
     """Read one trajectory and where its arrays lie.
 
     Raises:
@@ -114,7 +114,7 @@ def read_source(file: Path, key: str) -> Source:
                     cell_type=VTK_LINE if has_edges else VTK_VERTEX,
                 )
             )
-    return Source(file, key, metadata, trajectory, tuple(parts))
+    return Located(file, key, metadata, trajectory, tuple(parts))
 
 
 def _stored(group: h5py.Group, name: str) -> StoredArray:

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import DTypeLike
 
-from m3gn_bench.datasets.exports.parts import Part, Source, StoredArray, frame_times, read_source
+from m3gn_bench.datasets.exports.parts import Located, Part, StoredArray, frame_times, read_located
 from m3gn_bench.datasets.schema import fixed_length
 from m3gn_bench.datasets.writer import COMPRESSION, LIBVER, write_bytes_atomically
 
@@ -39,18 +39,18 @@ def export_vtkhdf(file: Path, key: str, out: Path) -> list[Path]:
     Raises:
         DatasetError: the dataset file is unusable, or `out` cannot be written.
     """
-    source = read_source(file, key)
+    located = read_located(file, key)
     written = []
-    for part in source.parts:
+    for part in located.parts:
         path = out if part.name == "mesh" else out.with_stem(f"{out.stem}-{part.name}")
-        write_bytes_atomically(path, _content(source, part, source.path_from(path)))
+        write_bytes_atomically(path, _content(located, part, located.path_from(path)))
         written.append(path)
     return written
 
 
-def _content(source: Source, part: Part, path: str) -> bytes:
+def _content(located: Located, part: Part, path: str) -> bytes:
     """The bytes of the file for a part, given the path from it to the dataset file."""
-    metadata, trajectory = source.metadata, source.trajectory
+    metadata, trajectory = located.metadata, located.trajectory
     frames, nodes, dimension = part.positions.shape
     cells, corners = (nodes, 1) if part.cells is None else part.cells.shape
     origin = path.replace("%", "%%")  # HDF5 takes a single one for the start of a pattern
@@ -58,7 +58,7 @@ def _content(source: Source, part: Part, path: str) -> bytes:
     with h5py.File(buffer, "w", libver=(LIBVER, LIBVER)) as file:
         provenance = {
             "scene": metadata.scene,
-            "trajectory": source.key,
+            "trajectory": located.key,
             "content_hash": trajectory.content_hash(),
             "length_unit": metadata.length_unit,
             "time_unit": metadata.time_unit,
@@ -83,7 +83,7 @@ def _content(source: Source, part: Part, path: str) -> bytes:
         still = np.zeros(frames, np.int64)
         steps = root.create_group("Steps")
         steps.attrs["NSteps"] = frames
-        steps["Values"] = frame_times(source.metadata)
+        steps["Values"] = frame_times(located.metadata)
         steps["NumberOfParts"] = still + 1
         steps["PartOffsets"] = still
         steps["PointOffsets"] = nodes * np.arange(frames)

@@ -13,7 +13,7 @@ from m3gn_bench.datasets.exports.parts import (
     Part,
     StoredArray,
     frame_times,
-    read_source,
+    read_located,
 )
 from m3gn_bench.datasets.trajectory import VTK_TETRA, VTK_TRIANGLE
 from m3gn_bench.datasets.writer import write_bytes_atomically
@@ -43,17 +43,17 @@ def export_xdmf(file: Path, key: str, out: Path) -> list[Path]:
     Raises:
         DatasetError: the dataset file is unusable, its path holds a colon, or `out` cannot be written.
     """
-    source = read_source(file, key)
-    origin = source.path_from(out)
+    located = read_located(file, key)
+    origin = located.path_from(out)
     if ":" in origin:
         raise DatasetError(f"XDMF cannot point to {origin}: a path with a colon; rename it, or use vtkhdf")
     root = ElementTree.Element("Xdmf", Version="3.0")
     domain = ElementTree.SubElement(root, "Domain")
-    for part in source.parts:
+    for part in located.parts:
         collection = ElementTree.SubElement(
             domain, "Grid", Name=part.name, GridType="Collection", CollectionType="Temporal"
         )
-        for frame, time in enumerate(frame_times(source.metadata)):
+        for frame, time in enumerate(frame_times(located.metadata)):
             _add_grid(collection, part, origin, frame, float(time))
     ElementTree.indent(root)
     write_bytes_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
