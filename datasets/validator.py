@@ -101,25 +101,33 @@ def _trajectory_problems(
     file: h5py.File, key: str, metadata: Metadata, hashes: dict[str, str]
 ) -> Iterator[Problem]:
     where = f"/trajectories/{key}"
-
-    def problem(
-        code: Literal["E003", "E004", "E005", "E006", "E007", "E008", "E009", "W002"], message: str
-    ) -> Problem:
-        return Problem(code=code, where=where, message=message)
-
     try:
         trajectory, stored = load_trajectory(file, key)
     except DatasetError as error:
-        yield problem("E003", str(error))
+        yield Problem(code="E003", where=where, message=str(error))
         return
-    mesh = trajectory.mesh
-    nodes = len(mesh.rest_positions)
     hashes[key] = stored
     for name in sorted(set(file[where]) - TRAJECTORY_GROUP):
-        yield problem("W002", f"{name} is unknown to the schema")
+        yield Problem(code="W002", where=where, message=f"{name} is unknown to the schema")
     if trajectory.content_hash() != stored:
-        yield problem("E009", "the content hash does not match")
+        yield Problem(code="E009", where=where, message="the content hash does not match")
+    yield from content_problems(trajectory, metadata, where)
 
+
+def content_problems(trajectory: Trajectory, metadata: Metadata, where: str) -> Iterator[Problem]:
+    """What is wrong with a trajectory, wherever it comes from.
+
+    Args:
+        trajectory: what to check.
+        metadata: of its dataset.
+        where: the place that the problems name.
+    """
+
+    def problem(code: Literal["E004", "E005", "E006", "E007", "E008"], message: str) -> Problem:
+        return Problem(code=code, where=where, message=message)
+
+    mesh = trajectory.mesh
+    nodes = len(mesh.rest_positions)
     misfits = list(_misfits(trajectory, metadata))
     yield from (problem("E004", misfit) for misfit in misfits)
     if misfits:
@@ -136,7 +144,10 @@ def _trajectory_problems(
     if not all(np.isfinite(value) for value in trajectory.material.values()):
         yield problem("E005", "the material is not finite")
     if not len(mesh.cells) or CELL_CORNERS.get(mesh.cell_type) != mesh.cells.shape[1]:
-        yield problem("E006", f"cells of shape {mesh.cells.shape} have VTK type {mesh.cell_type}")
+        yield problem(
+            "E006",
+            f"cells of shape {mesh.cells.shape} and VTK type {mesh.cell_type} are no triangles or tetrahedra",
+        )
         return
     if not 0 <= mesh.cells.min() <= mesh.cells.max() < nodes:
         yield problem("E006", f"cells refer to nodes {mesh.cells.min()}..{mesh.cells.max()} of {nodes}")
@@ -155,7 +166,7 @@ def _trajectory_problems(
 
 
 def _misfits(trajectory: Trajectory, metadata: Metadata) -> Iterator[str]:
-    """Arrays of another shape or type than the schema's; None stands for any length."""
+    """Arrays of another shape or type than the schema's."""
     mesh = trajectory.mesh
     frames, nodes, dimension = metadata.frames, mesh.rest_positions.shape[:1], metadata.dimension
     expected: dict[str, tuple[np.ndarray, tuple[int | None, ...], str]] = {
@@ -169,11 +180,15 @@ def _misfits(trajectory: Trajectory, metadata: Metadata) -> Iterator[str]:
     if trajectory.collider_edges is not None:
         expected["collider_edges"] = (trajectory.collider_edges, (None, 2), "int32")
     for name, (array, shape, dtype) in expected.items():
-        fits = len(array.shape) == len(shape) and all(
-            e in (None, a) for a, e in zip(array.shape, shape, strict=True)
-        )
-        if not fits or array.dtype != dtype:
+        if not has_shape(array, shape) or array.dtype != dtype:
             yield f"{name} is {array.shape} {array.dtype}, expected {shape} {dtype}"
+
+
+def has_shape(array: np.ndarray, expected: tuple[int | None, ...]) -> bool:
+    """Whether an array has a shape, in which None stands for any length."""
+    return array.ndim == len(expected) and all(
+        e in (None, a) for a, e in zip(array.shape, expected, strict=True)
+    )
 
 
 def cell_volumes(positions: np.ndarray, cells: np.ndarray, cell_type: int) -> np.ndarray:

@@ -173,11 +173,26 @@ def write_dataset(
     """
     hashes: dict[str, str] = {}
     members: dict[str, list[str]] = {}
-    with atomic_path(path) as temporary, _hdf5_errors(), h5py.File(temporary, "w", libver=LIBVER) as file:
+    with atomic_path(path) as temporary, _new_hdf5(temporary) as file:
         for key, trajectory in trajectories:
-            hashes[key] = _write_trajectory(file, key, trajectory)
+            with _hdf5_errors():
+                hashes[key] = _write_trajectory(file, key, trajectory)
             members.setdefault(f"splits/{task}/{parse_key(key)[0]}", []).append(key)
-        return _complete(file, members, hashes, describe())
+        metadata = describe()
+        with _hdf5_errors():
+            return _complete(file, members, hashes, metadata)
+
+
+@contextmanager
+def _new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """A new file: what HDF5 reports of it, which it may do as late as at the end, but nothing that the body raises."""
+    with _hdf5_errors():
+        file = h5py.File(path, "w", libver=LIBVER)
+    try:
+        yield file
+    finally:
+        with _hdf5_errors():
+            file.close()
 
 
 def _complete(

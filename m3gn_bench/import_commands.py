@@ -44,6 +44,7 @@ def import_command(
 ) -> None:
     """Make a dataset file of published data of others, for `train --dataset` and `evaluate --dataset`."""
     from m3gn_bench.data import case_from
+    from m3gn_bench.datasets.errors import DatasetError
     from m3gn_bench.datasets.imports.convert import Frames, import_dataset, open_source
     from m3gn_bench.datasets.schema import Metadata
     from m3gn_bench.datasets.trajectory import Trajectory
@@ -55,7 +56,12 @@ def import_command(
     source = open_source(layout, paths, task)
 
     def check(metadata: Metadata, key: str, trajectory: Trajectory) -> None:
-        case_from(task_of_data(task, metadata), metadata, trajectory, key)
+        told = task_of_data(task, metadata)
+        for feature in told.material:
+            value = trajectory.material[feature.name]
+            if feature.logarithmic and value <= 0:
+                raise DatasetError(f"{feature.name} is {value:g}, of which models are told the logarithm")
+        case_from(told, metadata, trajectory, key)
 
     with report.progress(f"importing {layout}") as on_progress:
         made = import_dataset(

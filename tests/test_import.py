@@ -5,6 +5,8 @@ import os
 import pickle
 import pickletools
 import struct
+import sys
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,9 +18,13 @@ from conftest import box_of_tetrahedra
 from google_crc32c import value as crc32c
 
 from m3gn_bench.cli import run
+from m3gn_bench.datasets import writer
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import find_dataset, open_file, read_metadata
+from m3gn_bench.datasets.imports.convert import import_dataset
+from m3gn_bench.datasets.imports.ggns import GgnsSource
 from m3gn_bench.datasets.imports.pickles import read_pickle
+from m3gn_bench.datasets.imports.source import Found
 from m3gn_bench.datasets.imports.tfrecord import count_records, parse_example, read_records
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.datasets.recorded import require_own
@@ -361,6 +367,20 @@ def test_models_of_fixed_horizon_take_the_length_of_the_data(command: Command, t
         assert [len(row["per_timestep_mse"]) for row in scores["results"]] == [18, 1]
 
 
+def test_predictions_are_drawn_beside_them(command: Command, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    out, _ = imported(command, Published(write_ggns(tmp_path / "plates"), "ggns", "deformable_block"))
+    model = ["--task", "deformable_block", "--model", "stand_still", "--out", tmp_path / "run"]
+    parsed(command("train", *model, "--steps", 1, "--preset", "smoke", "--dataset", out, "--json"))
+    picture = ["-o", tmp_path / "x.png", "--frames", 1, "--index", 1]
+    shown = parsed(command("view", out, "--checkpoint", tmp_path / "run", *picture, "--json"))
+    assert (shown["trajectory"], shown["panels"]) == ("test_00001", ["truth", "stand_still"])
+    assert_refused(
+        command("view", out, "--checkpoint", tmp_path / "run", "--task", "tissue_manipulation", *picture),
+        "unknown task 'tissue_manipulation'; known: deformable_block",
+    )
+
+
 def test_numbers_of_ggns(command: Command, tmp_path: Path) -> None:
     folder = write_ggns(tmp_path / "plates")
     out, _ = imported(command, Published(folder, "ggns", "deformable_block"))
@@ -605,8 +625,34 @@ def test_tfrecord_of_another_program(tmp_path: Path) -> None:
 def test_truncated_tfrecord(tmp_path: Path, kept: int) -> None:
     path = tmp_path / "a.tfrecord"
     path.write_bytes(BY_ANOTHER_PROGRAM[:kept])
-    with pytest.raises(DatasetError, match="truncated: it ends within record"):
-        list(read_records(path))
+    for read_all in (lambda: list(read_records(path)), lambda: count_records(path)):
+        with pytest.raises(DatasetError, match="truncated: it ends within record"):
+            read_all()
+
+
+@pytest.mark.parametrize("length", [2**45, 2**63])
+def test_lengths_that_no_file_has(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "a.tfrecord"
+    head = struct.pack("<Q", length)
+    path.write_bytes(BY_ANOTHER_PROGRAM + head + masked(head))
+    for read_all in (lambda: list(read_records(path)), lambda: count_records(path)):
+        with pytest.raises(DatasetError, match=r"a.tfrecord is truncated: it ends within record 2"):
+            read_all()
+
+
+def test_what_the_system_does_not_let_one_read(tmp_path: Path) -> None:
+    """A folder stands for all of that."""
+    for read_all in (read_pickle, count_records, lambda path: list(read_records(path))):
+        with pytest.raises(DatasetError, match=f"cannot read {tmp_path}: Is a directory"):
+            read_all(tmp_path)
+
+
+def test_records_without_the_library(
+    command: Command, shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "google_crc32c", None)
+    outcome = command("import", shelf / "deforming_plate", *DEEPMIND, "-o", tmp_path / "o.h5")
+    assert_refused(outcome, "reading TFRecord takes google-crc32c", "pip install 'm3gn-bench[import]'")
 
 
 @pytest.mark.parametrize("byte", [0, 9, 20, 48, 52])
@@ -636,6 +682,23 @@ def ruined(entry: dict[str, Any]) -> None:
     entry["nodes_grid"][3] = entry["nodes_grid"][3] * np.nan
 
 
+def flattened(entry: dict[str, Any]) -> None:
+    """The third node of a triangle is moved between the two others, in all frames."""
+    first, second, third = entry["triangles_grid"][0]
+    for frame in entry["nodes_grid"]:
+        frame[third] = (frame[first] + frame[second]) / 2
+
+
+def collapsed(entry: dict[str, Any]) -> None:
+    entry["nodes_grid"][0] = entry["nodes_grid"][0] * 0
+
+
+def out_of_range(entry: dict[str, Any]) -> None:
+    """In 32 bits it would be in range."""
+    entry["triangles_grid"] = entry["triangles_grid"].astype(np.int64)
+    entry["triangles_grid"][0, 0] += 2**32
+
+
 @pytest.mark.parametrize(
     ("spoil", "parts"),
     [
@@ -644,6 +707,21 @@ def ruined(entry: dict[str, Any]) -> None:
         (replaced(poisson_ratio="soft"), ["poisson_ratio holds", "not numbers"]),
         (replaced(triangles_grid=np.zeros((2, 3))), ["triangles_grid holds float64, not integers"]),
         (replaced(triangles_grid=np.array([[0, 1, 99]])), ["cells refer to nodes 0 to 99 of 16"]),
+        (out_of_range, ["cells refer to nodes 0 to 4294967296 of 16"]),
+        (replaced(triangles_grid=np.zeros((0, 3), int)), ["cells of shape (0, 3)", "are no triangles"]),
+        (flattened, ["the smallest cell at rest has volume 0"]),
+        (collapsed, ["all nodes start at the same place"]),
+        (
+            replaced(edge_index_collider=np.array([[0, 999], [1, 2]])),
+            ["collider edges refer to nodes 0 to 999 of 6"],
+        ),
+        (replaced(poisson_ratio=np.nan), ["the material is not finite"]),
+        (
+            replaced(nodes_collider=np.full((20, 6, 2), np.inf)),
+            ["collider_positions holds 240 numbers that are not"],
+        ),
+        (replaced(nodes_grid=np.zeros((0, 16, 2))), ["0 of its 0 frames are left"]),
+        (replaced(nodes_grid=np.zeros((20, 0, 2))), ["there are none"]),
         (
             replaced(nodes_grid=np.zeros((20, 16, 3))),
             ["nodes_grid has shape (20, 16, 3), expected (any, any, 2)"],
@@ -668,6 +746,47 @@ def test_spoiled_trajectories(command: Command, tmp_path: Path, spoil: Spoil, pa
     assert list(out.parent.iterdir()) == []
 
 
+def test_one_split_at_a_time_is_in_memory(tmp_path: Path) -> None:
+    opened: list[weakref.ref[Iterator[Found]]] = []
+
+    class Watched(GgnsSource):
+        def open(self, split: Split) -> tuple[int, Iterator[Found]]:
+            assert [found() for found in opened] == [None] * len(opened)
+            number, found = super().open(split)
+            opened.append(weakref.ref(found))
+            return number, found
+
+    source = Watched([write_ggns(tmp_path / "plates")], "deformable_block")
+    import_dataset(source, "ggns", "deformable_block", tmp_path / "o.h5", version="0")
+    assert len(opened) == 3
+
+
+def test_what_the_source_raises_is_not_the_writer_s(tmp_path: Path) -> None:
+    """Errors of HDF5 alone are taken for errors of writing."""
+
+    class Failing(GgnsSource):
+        def open(self, split: Split) -> tuple[int, Iterator[Found]]:
+            if split == "test":
+                raise RuntimeError("a mistake of ours")
+            return super().open(split)
+
+    source = Failing([write_ggns(tmp_path / "plates")], "deformable_block")
+    with pytest.raises(RuntimeError, match="a mistake of ours"):
+        import_dataset(source, "ggns", "deformable_block", tmp_path / "out" / "o.h5", version="0")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_full_disk(command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> str:
+        raise RuntimeError("Unable to flush file (errno = 28, error message = 'No space left on device')")
+
+    monkeypatch.setattr(writer, "_write_trajectory", refuse)
+    out = tmp_path / "out" / "o.h5"
+    outcome = command("import", write_ggns(tmp_path / "plates"), *GGNS, "-o", out)
+    assert_refused(outcome, f"cannot write {out}: No space left on device")
+    assert list(out.parent.iterdir()) == []
+
+
 GGNS = ["--layout", "ggns", "--task", "deformable_block"]
 MANGO = ["--layout", "mango", "--task", "sheet_deformation"]
 DEEPMIND = ["--layout", "deepmind", "--task", "tissue_manipulation"]
@@ -683,6 +802,8 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "short").mkdir()
     (folder / "short" / "data_train.pkl").write_bytes(pickle.dumps([plate(0, frames=15)]))
     write_deepmind(folder / "long_plate", lambda seed: deforming_plate(seed, frames=52))
+    (write_deepmind(folder / "half_plate") / "valid.tfrecord").unlink()
+    (folder / "half_plate" / "valid.tfrecord").mkdir()
     (folder / "half.hdf5").write_bytes((folder / "sheets.hdf5").read_bytes()[:3000])
     (folder / "other.pkl").write_bytes(pickle.dumps([]))
     (folder / "words_train.pkl").write_bytes(pickle.dumps({"a": 1}))
@@ -699,6 +820,7 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["plates", *GGNS, "--task", "tissue_manipulation"], ["'tissue_mesh_positions'", "known: edge_"]),
         (["absent", *GGNS], ["no .pkl file at absent"]),
         (["deforming_plate", *GGNS], ["no .pkl file at deforming_plate"]),
+        (["half_plate", *DEEPMIND], ["no .tfrecord file at half_plate/valid.tfrecord"]),
         (["other.pkl", *GGNS], ["must tell the split", "'other'", "known: eval, test, train"]),
         (["plates", "words_train.pkl", *GGNS], ["are of the train split"]),
         (["words_train.pkl", *GGNS], ["no list of trajectories"]),
@@ -727,6 +849,10 @@ def meta_changes() -> Iterator[tuple[str, Callable[[dict[str, Any]], object], st
     yield "remeshed", lambda m: m["features"]["cells"].update(type="dynamic_varlen"), "change with time"
     yield "type", lambda m: m["features"]["cells"].update(dtype="object"), "features.cells.dtype"
     yield "shape", lambda m: m["features"]["world_pos"].update(shape=[42, -1, 2]), "world_pos"
+    yield "dimension", lambda m: m["features"]["mesh_pos"].update(shape=[1, 8, -1]), "bodies in space"
+    yield "frames", lambda m: m["features"]["cells"].update(shape=[-1, 2, 4]), "do not belong together"
+    yield "cells of points", lambda m: m["features"]["cells"].update(shape=[1, -1, 1]), "neither triangles"
+    yield "cells of floats", lambda m: m["features"]["cells"].update(dtype="float32"), "not integers"
     yield "length", lambda m: m.update(trajectory_length=7), "do not belong together"
     yield "no length", lambda m: m.pop("trajectory_length"), "trajectory_length: Field required"
 
@@ -755,7 +881,7 @@ def pulled(entry: dict[str, np.ndarray]) -> None:
     [
         (lambda entry: entry.pop("cells"), "record 0: unknown entry 'cells'"),
         (lambda entry: entry.update(node_type=entry["node_type"] + np.int32(3)), "nodes of type"),
-        (lambda entry: entry["cells"].put(0, 999), "refer to nodes that do not exist"),
+        (lambda entry: entry["cells"].put(0, 999), "cells refer to nodes 0 to 999 of 32"),
         (lambda entry: entry["node_type"].put(np.flatnonzero(entry["node_type"] == 1)[0], 0), "of the body and of"),
         (pulled, "a node that the source holds moves by 0.1"),
     ],
@@ -769,6 +895,93 @@ def test_spoiled_records(
     (folder / "train.tfrecord").write_bytes(record(example(entry)))
     assert_refused(command("import", folder, *DEEPMIND, "-o", tmp_path / "o.h5"), part)
     assert not (tmp_path / "o.h5").exists()
+
+
+Damage = Callable[[h5py.File], object]
+ONE = "task_004/trajs/traj_000"
+
+
+def elsewhere(name: str) -> Damage:
+    """The array's bytes are those of another file."""
+
+    def point(file: h5py.File) -> None:
+        array = file.pop(name)
+        file.create_dataset(name, array.shape, array.dtype, external=[(__file__, 0, array.nbytes)])
+
+    return point
+
+
+def virtual(name: str) -> Damage:
+    def point(file: h5py.File) -> None:
+        array = file.pop(name)
+        layout = h5py.VirtualLayout(array.shape, array.dtype)
+        layout[:] = h5py.VirtualSource("other.hdf5", "x", array.shape)
+        file.create_virtual_dataset(name, layout)
+
+    return point
+
+
+def linked(name: str) -> Damage:
+    """What bears the name is in another file, by way of a link within this one."""
+
+    def point(file: h5py.File) -> None:
+        with h5py.File(Path(file.filename).with_name("other.hdf5"), "w") as other:
+            file.copy(name, other, "x")
+        del file[name]
+        file["hidden"] = h5py.ExternalLink("other.hdf5", "/x")
+        file[name] = h5py.SoftLink("/hidden")
+
+    return point
+
+
+def empty(name: str, *shape: int) -> Damage:
+    """An array of which nothing is stored."""
+
+    def declare(file: h5py.File) -> None:
+        del file[name]
+        file.create_dataset(name, shape, "f4")
+
+    return declare
+
+
+def changed(name: str, value: object) -> Damage:
+    def change(file: h5py.File) -> None:
+        del file[name]
+        file[name] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "part"),
+    [
+        (elsewhere(f"{ONE}/mesh_pos"), "mesh_pos is kept in another file"),
+        (elsewhere("global_data/cells"), "cells is kept in another file"),
+        (virtual("global_data/cells"), "cells is kept in another file"),
+        (linked(f"{ONE}/mesh_pos"), "mesh_pos is in another file"),
+        (linked("global_data"), "global_data is in another file"),
+        (linked(f"{ONE}/params/a"), "a is in another file"),
+        (empty(f"{ONE}/mesh_pos", 2**49, 3), "has 0 bytes in the file"),
+        (changed(f"{ONE}/mesh_pos", np.zeros((0, 25, 3))), "is closer than 10 mm to no node"),
+        (changed(f"{ONE}/params/b/position", [500.0, 0.0, 0.0]), "params/b: the force is closer than 10 mm to no node"),
+        (changed("task_004/params/youngs_modulus", 0.0), "youngs_modulus is 0, of which models are told the logarithm"),
+    ],
+)  # fmt: skip
+def test_spoiled_hdf5(command: Command, tmp_path: Path, damage: Damage, part: str) -> None:
+    path = write_mango(tmp_path / "sheets.hdf5", "sheet_deformation")
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    assert_refused(command("import", path, *MANGO, "-o", tmp_path / "o.h5"), str(path), part)
+    assert not (tmp_path / "o.h5").exists()
+
+
+def test_large_indices_of_colliders(command: Command, tmp_path: Path) -> None:
+    """In 32 bits they would be in range."""
+    path = write_mango(tmp_path / "plates.hdf5", "deformable_block")
+    with h5py.File(path, "r+") as file:
+        changed("global_data/cell_indices/collider_faces", np.array([[0, 1, 2 + 2**32]]))(file)
+    outcome = command("import", path, *MANGO, "--task", "deformable_block", "-o", tmp_path / "o.h5")
+    assert_refused(outcome, "collider edges refer to nodes 0 to 4294967298 of 6")
 
 
 def test_damage_in_the_middle_leaves_nothing(command: Command, tmp_path: Path) -> None:

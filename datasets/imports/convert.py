@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
-from m3gn_bench.datasets.imports.source import Facts, Found, Source
+from m3gn_bench.datasets.imports.source import Facts, Found, Source, indices
 from m3gn_bench.datasets.schema import IMPORTED, NO_SEED, SPLITS, Metadata, Split, trajectory_key
 from m3gn_bench.datasets.trajectory import CELL_CORNERS, FIXED, FREE, Mesh, Trajectory
-from m3gn_bench.datasets.validator import cell_volumes
+from m3gn_bench.datasets.validator import cell_volumes, content_problems
 from m3gn_bench.datasets.writer import write_dataset
 
 STILL = 1e-6  # of the body's size: a node that moves by less, in all frames, stays where it is
@@ -126,7 +126,7 @@ class _Draft:
     upper: NDArray[np.float64] = field(default_factory=lambda: np.array(-np.inf))
 
     def add(self, split: Split, where: str, trajectory: Trajectory) -> None:
-        """Count a trajectory. Raises DatasetError if it has another length than those before."""
+        """Count a trajectory. Raises DatasetError if it has no size, or another length than those before."""
         found = len(trajectory.positions)
         self.frames = self.frames or found
         if found != self.frames:
@@ -134,6 +134,8 @@ class _Draft:
                 f"{where} has {found} frames, those before it {self.frames}; --frames {min(found, self.frames)} "
                 "makes them equal"
             )
+        if not np.ptp(trajectory.positions[0], axis=0).any():
+            raise DatasetError(f"{where}: all nodes start at the same place")
         self.sizes[split] += 1
         self.lower = np.minimum(self.lower, trajectory.positions[0].min(0))
         self.upper = np.maximum(self.upper, trajectory.positions[0].max(0))
@@ -172,7 +174,11 @@ def _converted(
     check: Check,
     on_progress: Callable[[int, int], None],
 ) -> Iterator[tuple[str, Trajectory]]:
-    """Key and content of every trajectory, in the order of the splits."""
+    """Key and content of every trajectory, in the order of the splits.
+
+    Raises:
+        DatasetError: a file of them would not be valid.
+    """
     for split in (split for split in SPLITS if split in source.splits):
         number, found = source.open(split)
         total = number if limit is None else min(limit, number)
@@ -180,41 +186,43 @@ def _converted(
             key = trajectory_key(split, index)
             trajectory = convert(one, frames)
             draft.add(split, one.where, trajectory)
+            metadata = draft.metadata()
+            problem = next(content_problems(trajectory, metadata, one.where), None)
+            if problem is not None:
+                raise DatasetError(f"{problem.where}: {problem.message}")
             try:
-                check(draft.metadata(), key, trajectory)
+                check(metadata, key, trajectory)
             except DatasetError as error:
                 raise DatasetError(f"{one.where}: {error}") from error
             yield key, trajectory
             on_progress(index + 1, total)
+        del found  # which may hold a whole split, before the next is opened
 
 
 def convert(found: Found, frames: Frames) -> Trajectory:
-    """A trajectory as the schema has it: float32, cells of positive volume, held nodes marked and still.
+    """A trajectory in the types of the schema: no cell inside out, held nodes marked and still.
 
     Raises:
-        DatasetError: too few frames, numbers that are not finite, cells of nodes that do not exist, a held node
-            that moves, or nothing that moves.
+        DatasetError: what that needs is missing: finite positions, a frame of the collider for each of the mesh, two
+            frames to keep, cells of triangles or tetrahedra, indices of nodes that exist, held nodes that do not
+            move, and others that do.
     """
     positions = np.asarray(found.positions, np.float32)
-    rest = positions[0] if found.rest_positions is None else np.asarray(found.rest_positions, np.float32)
-    path = found.collider_positions
-    numbers = {"positions": positions, "rest positions": rest, **found.loads}
-    if path is not None:
-        path = np.asarray(path, np.float32)
-        numbers["collider positions"] = path
-        if len(path) != len(positions):
-            raise DatasetError(
-                f"{found.where}: the mesh has {len(positions)} frames, its collider {len(path)}"
-            )
-    for name, values in numbers.items():
-        if not np.isfinite(values).all():
-            raise DatasetError(f"{found.where}: {name} are not finite")
+    path = None if found.collider_positions is None else np.asarray(found.collider_positions, np.float32)
     kept = frames.of(positions)
     if len(kept) < 2:
         raise DatasetError(
             f"{found.where}: {len(kept)} of its {len(positions)} frames are left; keep two or more"
         )
-
+    # Of all frames, not only those that are kept: they tell which nodes are held.
+    if not positions.size or not np.isfinite(positions).all():
+        raise DatasetError(f"{found.where}: positions are not finite, or there are none")
+    if path is not None and len(path) != len(positions):
+        raise DatasetError(f"{found.where}: the mesh has {len(positions)} frames, its collider {len(path)}")
+    rest = positions[0] if found.rest_positions is None else np.asarray(found.rest_positions, np.float32)
+    edges = found.collider_edges
+    if edges is not None:
+        edges = indices(edges, 0 if path is None else path.shape[1], "collider edges", found.where)
     cells, cell_type = _cells(found, rest)
     held = _held(found, positions)
     return Trajectory(
@@ -228,22 +236,18 @@ def convert(found: Found, frames: Frames) -> Trajectory:
         material=found.material,
         loads=found.loads,
         collider_positions=None if path is None else frames.of(path),
-        collider_edges=None if found.collider_edges is None else found.collider_edges.astype(np.int32),
+        collider_edges=edges,
         tags=found.tags,
     )
 
 
 def _cells(found: Found, rest: NDArray[np.float32]) -> tuple[NDArray[np.int32], int]:
     """The cells, with two corners of those swapped that are inside out, and their VTK type."""
-    cells = found.cells.astype(np.int32)
+    cells = indices(found.cells, len(rest), "cells", found.where)
     types = {corners: cell_type for cell_type, corners in CELL_CORNERS.items()}
-    if not cells.size or cells.shape[1] not in types:
+    if cells.shape[1] not in types:
         raise DatasetError(
             f"{found.where}: cells of shape {cells.shape} are neither triangles nor tetrahedra"
-        )
-    if cells.min() < 0 or cells.max() >= len(rest):
-        raise DatasetError(
-            f"{found.where}: cells refer to nodes {cells.min()} to {cells.max()} of {len(rest)}"
         )
     cell_type = types[cells.shape[1]]
     inverted = cell_volumes(rest, cells, cell_type) < 0

@@ -12,13 +12,23 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.imports.source import Facts, Found, edges_of, files_by_split, required
+from m3gn_bench.datasets.imports.source import (
+    Facts,
+    Found,
+    edges_of,
+    files_by_split,
+    indices,
+    reading,
+    required,
+)
 from m3gn_bench.datasets.imports.tfrecord import count_records, parse_example, read_records
 from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.validator import has_shape
 
 META = "meta.json"
 # Whatever the body is, these tasks tell models what the data have: positions, and a body's or obstacle's path.
 TASKS = ("tissue_manipulation", "falling_teddy")
+DIMENSION = 3  # of these tasks
 NORMAL, OBSTACLE, HANDLE = 0, 1, 3  # node types; the others are of flows
 FIELDS = {"world_pos": "dynamic", "mesh_pos": "static", "cells": "static", "node_type": "static"}
 
@@ -84,14 +94,21 @@ class DeepMindSource:
         except ValueError as error:
             raise DatasetError(f"{where} is no tf.train.Example ({error})") from error
         arrays = {name: self._array(entries, name, where) for name in self.features}
-        place, cells, kind = arrays["world_pos"], arrays["cells"][0], arrays["node_type"][0, :, 0]
-        rest = arrays["mesh_pos"][0]
-        nodes = len(kind)
-        if place.shape[:2] != (self.frames, nodes) or len(rest) != nodes:
+        nodes = arrays["world_pos"].shape[1]
+        expected = {
+            "world_pos": (self.frames, nodes, DIMENSION),
+            "mesh_pos": (1, nodes, None),
+            "cells": (1, None, None),
+            "node_type": (1, nodes, 1),
+        }
+        fit = all(has_shape(arrays[name], shape) for name, shape in expected.items())
+        if not fit or arrays["mesh_pos"].shape[2] > DIMENSION:
             shapes = ", ".join(f"{name} {found.shape}" for name, found in arrays.items())
-            raise DatasetError(f"{where}: arrays do not belong together: {shapes}")
-        if not cells.size or cells.min() < 0 or cells.max() >= nodes:
-            raise DatasetError(f"{where}: there are no cells, or they refer to nodes that do not exist")
+            raise DatasetError(
+                f"{where}: arrays do not belong together, or are not of bodies in space: {shapes}"
+            )
+        place, rest, kind = arrays["world_pos"], arrays["mesh_pos"][0], arrays["node_type"][0, :, 0]
+        cells = indices(arrays["cells"][0], nodes, "cells", where)
         unknown = set(kind.tolist()) - {NORMAL, OBSTACLE, HANDLE}
         if unknown:
             raise DatasetError(
@@ -109,7 +126,7 @@ class DeepMindSource:
             positions=place[:, ~obstacle],
             cells=number[body_cells],
             # A cloth's stress-free shape is given in its own two coordinates: laid out flat in space.
-            rest_positions=np.pad(rest, ((0, 0), (0, place.shape[2] - rest.shape[1])))[~obstacle],
+            rest_positions=np.pad(rest, ((0, 0), (0, DIMENSION - rest.shape[1])))[~obstacle],
             held=(kind == HANDLE)[~obstacle],
             collider_positions=place[:, obstacle] if obstacle.any() else None,
             collider_edges=edges_of(number[obstacle_cells]) if len(obstacle_cells) else None,
@@ -128,12 +145,13 @@ class DeepMindSource:
 
 
 def _read_meta(path: Path) -> Meta:
-    try:
-        return Meta.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
+    if not path.is_file():
         raise DatasetError(
             f"there is no {path}, which belongs to the TFRecord files and gives the shape of their arrays"
-        ) from None
+        )
+    try:
+        with reading(path):
+            return Meta.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise _misfit(path, error, "") from error
 

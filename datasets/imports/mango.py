@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.file import damage_as_dataset_error
+from m3gn_bench.datasets.file import damage_as_dataset_error, require_stored
 from m3gn_bench.datasets.imports.source import (
     SPLIT_WORDS,
     UNKNOWN_UNIT,
@@ -29,7 +29,9 @@ from m3gn_bench.datasets.imports.source import (
 )
 from m3gn_bench.datasets.schema import Split
 
-FORCE_RADIUS = 10.0  # [mm]; nodes strictly within it, in the plane of the sheet, are told the force
+FORCE_RADIUS = (
+    10.0  # [mm], the authors'; nodes strictly within it, in the plane of the sheet, are told the force
+)
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,7 @@ class MangoSource:
     def open(self, split: Split) -> tuple[int, Iterator[Found]]:
         """Number of trajectories of a split, and the trajectories."""
         with damage_as_dataset_error(str(self.path)), h5py.File(self.path) as file:
-            name = f"{self.words[split]}_indices"
-            numbers = array(file["splits"], name, f"{self.path}: /splits", (None,), whole=True)
+            numbers = _array(_group(file, "splits"), f"{self.words[split]}_indices", (None,), whole=True)
             pairs = [
                 (task, trajectory)
                 for task in (f"task_{number:03d}" for number in numbers)
@@ -117,50 +118,73 @@ class MangoSource:
 
     def _found(self, file: h5py.File, task: str, trajectory: str) -> Found:
         names, dimension = self.names, self.names.dimension
-        place = f"{task}/trajs/{trajectory}"
-        where = f"{self.path}: /{place}"
-        stored = _group(file, place)
-        positions = array(stored, "mesh_pos", where, (None, None, dimension))
+        stored = _group(file, f"{task}/trajs/{trajectory}")
+        positions = _array(stored, "mesh_pos", (None, None, dimension))
         path = edges = None
         if names.collider_cells is not None:
-            path = array(stored, "collider_pos", where, (None, None, dimension))
+            path = _array(stored, "collider_pos", (None, None, dimension))
             edges = edges_of(_cells(file, names.collider_cells))
         parameters = _group(file, f"{task}/params")
         return Found(
-            where=where,
+            where=_place(stored),
             positions=positions,
             cells=_cells(file, names.cells),
-            material={
-                name: float(array(parameters, name, f"{self.path}: /{task}/params", ()))
-                for name in self.facts.material_units
-            },
-            loads={"nodal_forces": _nodal_forces(file, place, positions[0])} if names.has_forces else {},
+            material={name: float(_array(parameters, name, ())) for name in self.facts.material_units},
+            loads={"nodal_forces": _nodal_forces(_group(stored, "params"), positions)}
+            if names.has_forces
+            else {},
             collider_positions=path,
             collider_edges=edges,
             tags={"task": task, "trajectory": trajectory},
         )
 
 
-def _group(file: h5py.File, place: str) -> h5py.Group:
-    """The group at a place. Raises DatasetError listing what is there instead."""
-    group = file
-    for name in place.split("/"):
-        group = required(group, name, f"{file.filename}: {group.name}")
+def _place(group: h5py.Group) -> str:
+    return f"{group.file.filename}: {group.name}"
+
+
+def _group(group: h5py.Group, path: str) -> h5py.Group:
+    """The group there. Raises DatasetError listing what is there instead, or if it is in another file."""
+    for name in path.split("/"):
+        group = _own(group, name)
     return group
 
 
-def _cells(file: h5py.File, place: str) -> np.ndarray:
-    folder, _, name = place.rpartition("/")
-    return array(_group(file, folder), name, f"{file.filename}: /{folder}", (None, 3), whole=True)
+def _own(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
+    """What a group holds, unless a link leads out of the file, to whatever lies on the reader's machine."""
+    found = required(group, name, _place(group))
+    if found.file != group.file:
+        raise DatasetError(f"{_place(group)}: {name} is in another file, which is not read")
+    return found
 
 
-def _nodal_forces(file: h5py.File, place: str, sheet: np.ndarray) -> NDArray[np.float32]:
-    """Every force, whole, at every node close to it, as the authors' own models are told; shape [nodes, 3]."""
-    forces = np.zeros(sheet.shape, np.float32)
-    for name, group in _group(file, f"{place}/params").items():
-        where = f"{file.filename}: /{place}/params/{name}"
-        position = array(group, "position", where, (3,))
-        direction = array(group, "direction", where, (3,))
-        distance = np.linalg.norm(sheet[:, :2] - position[:2], axis=1)
-        forces[distance < FORCE_RADIUS] += direction.astype(np.float32)
-    return forces
+def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *, whole: bool = False) -> np.ndarray:
+    """An array of this very file; see `array`."""
+    require_stored(_own(group, name))
+    return array(group, name, _place(group), shape, whole=whole)
+
+
+def _cells(file: h5py.File, path: str) -> np.ndarray:
+    folder, _, name = path.rpartition("/")
+    return _array(_group(file, folder), name, (None, 3), whole=True)
+
+
+def _nodal_forces(forces: h5py.Group, positions: np.ndarray) -> NDArray[np.float32]:
+    """Every force, whole, at every node close to it; shape [nodes, 3].
+
+    Forces that overlap are added up, in the one place that the task has for them; the authors' own models are told
+    each by itself, and take the distance in space.
+
+    Raises:
+        DatasetError: a force is close to no node.
+    """
+    nodal = np.zeros(positions.shape[1:], np.float32)
+    for name in forces:
+        force = _group(forces, name)
+        position = _array(force, "position", (3,))
+        direction = _array(force, "direction", (3,))
+        near = (np.linalg.norm(positions[:1, :, :2] - position[:2], axis=-1) < FORCE_RADIUS).any(0)
+        if not near.any():
+            raise DatasetError(f"{_place(force)}: the force is closer than {FORCE_RADIUS:g} mm to no node")
+        nodal[near] += direction.astype(np.float32)
+    return nodal

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.imports.source import reading
 
 PLAIN_KINDS = "biuf"  # of numpy types: truth values, integers, floats
 
@@ -123,13 +124,13 @@ def read_pickle(path: Path) -> Any:
     Raises:
         DatasetError: it asks for anything else (which is named, and was not called), is damaged, or no pickle.
     """
-    try:
-        with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
+        try:
             return _Unpickler(file).load()
-    except _RefusedError as error:
-        raise DatasetError(
-            f"{path} asks for {error}, and was not read: only numpy arrays, numbers, words and plain containers are "
-            "admitted, because a pickle can run anything"
-        ) from None
-    except Exception as error:  # a damaged pickle raises whatever its instructions happen to raise
-        raise DatasetError(f"{path} is no pickle of plain arrays, or damaged ({error})") from error
+        except _RefusedError as error:
+            raise DatasetError(
+                f"{path} asks for {error}, and was not read: only numpy arrays, numbers, words and plain containers "
+                "are admitted, because a pickle can run anything"
+            ) from None
+        except Exception as error:  # a damaged pickle raises whatever its instructions happen to raise
+            raise DatasetError(f"{path} is no pickle of plain arrays, or damaged ({error})") from error

@@ -1,7 +1,9 @@
 """What every reader of a foreign layout delivers, and the checks of arrays that all of them share."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
 from m3gn_bench.datasets.schema import Split
+from m3gn_bench.datasets.validator import has_shape
 
 UNKNOWN_UNIT = "unit of the source"
 LISTED = 20  # entries that a message names
@@ -104,10 +107,10 @@ def files_by_split(paths: Sequence[Path], ending: str) -> dict[Split, Path]:
     """
     files: dict[Split, Path] = {}
     for path in paths:
-        found = sorted(path.glob(f"*{ending}")) if path.is_dir() else [path]
-        if not found or not found[0].is_file():
-            raise DatasetError(f"no {ending} file at {path}")
-        for file in found:
+        in_folder = sorted(path.glob(f"*{ending}")) if path.is_dir() else []
+        for file in in_folder or [path]:
+            if not file.is_file():
+                raise DatasetError(f"no {ending} file at {file}")
             word = file.stem.rpartition("_")[2]
             if word not in SPLIT_WORDS:
                 raise DatasetError(
@@ -121,6 +124,19 @@ def files_by_split(paths: Sequence[Path], ending: str) -> dict[Split, Path]:
                 )
             files[split] = file
     return files
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What the operating system refuses becomes one line that names the file.
+
+    Raises:
+        DatasetError: it refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def array(
@@ -145,10 +161,7 @@ def array(
         raise DatasetError(f"{where}: {name} is no array of numbers ({error})") from error
     if result.dtype.kind not in ("iu" if whole else "iuf"):
         raise DatasetError(f"{where}: {name} holds {result.dtype}, not {'integers' if whole else 'numbers'}")
-    fits = len(result.shape) == len(shape) and all(
-        e in (None, a) for e, a in zip(shape, result.shape, strict=True)
-    )
-    if not fits:
+    if not has_shape(result, shape):
         expected = ", ".join("any" if length is None else str(length) for length in shape)
         raise DatasetError(f"{where}: {name} has shape {result.shape}, expected ({expected})")
     return result
@@ -163,8 +176,17 @@ def required(entry: Mapping[str, Any], name: str, where: str) -> Any:
     return entry[name]
 
 
-def edges_of(cells: np.ndarray) -> NDArray[np.int32]:
+def indices(values: np.ndarray, nodes: int, name: str, where: str) -> NDArray[np.int32]:
+    """Node indices as the schema has them. Raises DatasetError if they are none, or of nodes that do not exist."""
+    if values.dtype.kind not in "iu":
+        raise DatasetError(f"{where}: {name} hold {values.dtype}, not integers")
+    # Before they are narrowed, which would make large ones small.
+    if values.size and not 0 <= values.min() <= values.max() < nodes:
+        raise DatasetError(f"{where}: {name} refer to nodes {values.min()} to {values.max()} of {nodes}")
+    return values.astype(np.int32)
+
+
+def edges_of(cells: np.ndarray) -> np.ndarray:
     """Every edge of simplices [cells, corners] once, shape [edges, 2]."""
-    corners = cells.shape[1]
-    pairs = [cells[:, [i, j]] for i in range(corners) for j in range(i + 1, corners)]
-    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0).astype(np.int32)
+    pairs = cells[:, list(combinations(range(cells.shape[1]), 2))]
+    return np.unique(np.sort(pairs.reshape(-1, 2), axis=1), axis=0)

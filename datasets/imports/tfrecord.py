@@ -5,12 +5,14 @@ tf.train.Example: named lists of byte strings. Formats: https://www.tensorflow.o
 https://protobuf.dev/programming-guides/encoding
 """
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.imports.source import reading
 
 CHECKSUM_BYTES = 4
 VARINT, FIXED64, DELIMITED, FIXED32 = 0, 1, 2, 5  # wire types
@@ -20,15 +22,14 @@ def read_records(path: Path) -> Iterator[bytes]:
     """The content of every record, in order.
 
     Raises:
-        DatasetError: the file ends within a record, a checksum does not match, or google-crc32c is missing.
+        DatasetError: the file cannot be read or ends within a record, a checksum does not match, or google-crc32c
+            is missing.
     """
     checksum = _checksum()
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         number = 0
         while (length := _length(file, path, number, checksum)) is not None:
             content = file.read(length)
-            if len(content) < length:
-                raise DatasetError(f"{path} is truncated: it ends within record {number}; download it again")
             _verify(content, file.read(CHECKSUM_BYTES), path, number, checksum)
             yield content
             number += 1
@@ -37,7 +38,7 @@ def read_records(path: Path) -> Iterator[bytes]:
 def count_records(path: Path) -> int:
     """Number of records; only their lengths are read. Raises DatasetError as `read_records` does."""
     checksum = _checksum()
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         number = 0
         while (length := _length(file, path, number, checksum)) is not None:
             file.seek(length + CHECKSUM_BYTES, 1)
@@ -62,21 +63,28 @@ def _checksum() -> Callable[[bytes], int]:
 
 
 def _length(file: BinaryIO, path: Path, number: int, checksum: Callable[[bytes], int]) -> int | None:
-    """Length of the next record, or None at the end of the file."""
+    """Length of the next record, all of which is there, or None at the end of the file."""
     head = file.read(8)
     if not head:
         return None
     _verify(head, file.read(CHECKSUM_BYTES), path, number, checksum)
-    return struct.unpack("<Q", head)[0]
+    length = struct.unpack("<Q", head)[0]
+    if length + CHECKSUM_BYTES > os.fstat(file.fileno()).st_size - file.tell():
+        raise _truncated(path, number)
+    return length
 
 
 def _verify(content: bytes, stored: bytes, path: Path, number: int, checksum: Callable[[bytes], int]) -> None:
     if len(stored) < CHECKSUM_BYTES:
-        raise DatasetError(f"{path} is truncated: it ends within record {number}; download it again")
+        raise _truncated(path, number)
     if struct.unpack("<I", stored)[0] != checksum(content):
         raise DatasetError(
             f"{path} is damaged or no TFRecord: the checksum of record {number} does not match; download it again"
         )
+
+
+def _truncated(path: Path, number: int) -> DatasetError:
+    return DatasetError(f"{path} is truncated: it ends within record {number}; download it again")
 
 
 def parse_example(content: bytes) -> dict[str, bytes]:
