@@ -182,6 +182,10 @@ class BayesianEncoder(ContextEncoder):
 
     outputs_per_latent = 2
 
+    def pairs_to_read(self, most: int, rng: np.random.Generator) -> int:
+        """Always as many: the last pair alone says nothing of a sum over all."""
+        return most
+
     def aggregate(
         self, latents: Tensor, pairs: Tensor, body: Body, rng: np.random.Generator | None
     ) -> Tensor:

@@ -61,13 +61,13 @@ def memory_given_back() -> AbstractContextManager[Any]:
 
 # name in the table, what is overridden, what is exchanged in the code
 VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
-    "as it is": ({}, None),  # two context pairs, one trajectory per step
+    "as it is": ({}, None),  # one or two context pairs, one trajectory per step
     "usual edge layer": ({}, usual_layers),
-    "all context pairs": ({"model.training_context_pairs": None}, None),
-    "one context pair": ({"model.training_context_pairs": 1}, None),
+    "all context pairs": ({"model.max_training_context_pairs": None}, None),
+    "one context pair": ({"model.max_training_context_pairs": 1}, None),
     "four trajectories per step": ({"training.batch_size": 4}, None),
-    "four and all pairs": ({"training.batch_size": 4, "model.training_context_pairs": None}, None),
-    "four and one pair": ({"training.batch_size": 4, "model.training_context_pairs": 1}, None),
+    "four and all pairs": ({"training.batch_size": 4, "model.max_training_context_pairs": None}, None),
+    "four and one pair": ({"training.batch_size": 4, "model.max_training_context_pairs": 1}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
     "constant learning rate": ({"training.cosine_decay": False}, None),
     "no scaling by the data's spread": ({}, no_scaling),

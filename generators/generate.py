@@ -1,6 +1,5 @@
 """Make a dataset: draw, simulate, check, shard, merge. Resumable, and the same for any number of workers."""
 
-import os
 import platform
 import shutil
 import time
@@ -31,6 +30,7 @@ from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.executors import parse_executor
 from m3gn_bench.generators.scene import Scene
 from m3gn_bench.generators.workers import run_jobs
+from m3gn_bench.provenance import machine
 from m3gn_bench.version import __version__
 
 MAX_ATTEMPTS = 10
@@ -199,14 +199,6 @@ def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadat
         scale_length=scene.scale_length,
         machine=machine(),
     )
-
-
-def machine() -> str:
-    """The processor, for the record."""
-    names = Path("/proc/cpuinfo")
-    lines = names.read_text().splitlines() if names.is_file() else []
-    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
-    return f"{model or platform.processor() or platform.machine()}, {os.cpu_count()} cores"
 
 
 def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:

@@ -123,7 +123,9 @@ def _deformable_block() -> Knobs:
         settings=(
             *_fidelities(DeformableBlock),
             Setting("time step", "1 per frame", replace(default, transient_steps=())),
-            Setting("time step", "8, 4, 4, 2, 2, 2, then 1", replace(default, transient_steps=(8, 4, 4, 2, 2, 2))),
+            Setting(
+                "time step", "8, 4, 4, 2, 2, 2, then 1", replace(default, transient_steps=(8, 4, 4, 2, 2, 2))
+            ),
             Setting("time step", "half the default's", times(2)),
             *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-1, 1e-3, 1e-5)),
             Setting("mesh", "16 x 16", replace(default, cells=16)),

@@ -20,6 +20,7 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
 
 import shutil
 import tomllib
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,9 @@ from m3gn_bench.datasets.file import content_hash, open_file, read_metadata
 from m3gn_bench.datasets.schema import TIERS, Record, Split
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import (
+    Name,
     ResultRecord,
+    Variant,
     checkpoint_folder,
     find_record,
     run_name,
@@ -58,7 +61,7 @@ class Grid(Record):
     preset: str = "compact"
     minutes: float | None = None
     steps: int | None = None
-    variant: str = Field(default="", pattern=r"^[\w .+=-]*$")  # it becomes part of file names
+    variant: Variant = ""
     settings: dict[str, Any] = Field(default={})
     materials: Materials = Field(default={})
 
@@ -66,7 +69,7 @@ class Grid(Record):
 class Plan(Record):
     """What a campaign's file says."""
 
-    track: str = Field(pattern=r"^\w+$")
+    track: Name
     tier: str = "paper"
     split: Split = "test"
     runs: tuple[Grid, ...] = Field(min_length=1)
@@ -99,7 +102,8 @@ class PlannedRun:
         same = (
             found.checkpoint.config.model_dump() == self.config.to_json()
             and found.dataset_version == dataset_version
-            and (found.tier, found.split, found.materials) == (self.tier, self.split, self.materials)
+            and (found.tier, found.split, found.materials, found.ships)
+            == (self.tier, self.split, self.materials, self.ships)
         )
         return "done" if same else "outdated"
 
@@ -143,6 +147,10 @@ def _planned(plan: Plan, grid: Grid, task_name: str, model: str, seed: int) -> P
     settings = grid.settings | {key: value for key, value in budget.items() if value is not None}
     config = load_preset(model, grid.preset, task, settings)
     require_budget(config, build_model(config, task).is_learned)
+    if grid.shipped_seeds and grid.variant:
+        raise ConfigError(
+            "checkpoints of a variant cannot ship: their folders are named by model, preset and seed"
+        )
     return PlannedRun(
         track=plan.track,
         task=task_name,
@@ -164,13 +172,11 @@ class Job:
         run: which one.
         dataset: file with all splits of the run's tier.
         runs: folder of unfinished and finished training runs.
-        home: the leaderboard's folder.
     """
 
     run: PlannedRun
     dataset: Path
     runs: Path
-    home: Path
 
 
 @dataclass(frozen=True)
@@ -178,14 +184,28 @@ class Outcome:
     """What came of a run: its record, or why there is none."""
 
     run: PlannedRun
+    folder: Path
     record: ResultRecord | None
     error: str | None
 
+    def keep(self, home: Path) -> None:
+        """Write the record to its place in the leaderboard's folder, and the checkpoint if it ships."""
+        if self.record is None:
+            return
+        if self.run.ships:
+            config = self.run.config
+            shipped = checkpoint_folder(self.run.task, config.model_name, config.preset, self.run.seed, home)
+            shutil.rmtree(shipped, ignore_errors=True)
+            half_written = shutil.ignore_patterns(".*")  # left by a process that was killed
+            shutil.copytree(self.folder, shipped, ignore=half_written)
+        write_record(self.record, home)
+
 
 def carry_out(job: Job) -> Outcome:
-    """Train (or go on), score, and write the record; errors of the run are returned, for others can go on."""
+    """Train (or go on) and score; errors of the run are returned, for others can go on."""
     run = job.run
     task = get_task(run.task)
+    folder = job.runs / run.track / run.task
     try:
         with open_file(job.dataset) as file:
             version = read_metadata(file).dataset_version
@@ -196,7 +216,7 @@ def carry_out(job: Job) -> Outcome:
         # An older run of that name, with other settings or data, is no obstacle.
         budget = run.config.training
         stamp = f"{run.config.hash()[:8]}-{budget.minutes or budget.steps or 0:g}-{version}"
-        folder = job.runs / run.track / run.task / f"{run.name}-{stamp}"
+        folder /= f"{run.name}-{stamp}"
         train(run.config, task, training, validation, folder, seed=run.seed, dataset_hash=dataset_hash)
         record = score(
             folder,
@@ -209,11 +229,7 @@ def carry_out(job: Job) -> Outcome:
             ships=run.ships,
         )
     except BenchError as error:
-        return Outcome(run, None, str(error))
-    if run.ships:
-        shipped = checkpoint_folder(run.task, run.config.model_name, run.config.preset, run.seed, job.home)
-        shutil.rmtree(shipped, ignore_errors=True)
-        half_written = shutil.ignore_patterns(".*")  # left by a process that was killed
-        shutil.copytree(folder, shipped, ignore=half_written)
-    write_record(record, job.home)
-    return Outcome(run, record, None)
+        return Outcome(run, folder, None, str(error))
+    except Exception as error:  # a defect that this run shows need not be in the way of others
+        return Outcome(run, folder, None, "".join(traceback.format_exception(error)))
+    return Outcome(run, folder, record, None)

@@ -3,11 +3,14 @@
 from collections.abc import Callable, Sequence
 from typing import Literal
 
+import numpy as np
+
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.evaluation import evaluate_model
-from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder
-from m3gn_bench.sources import regenerate
+from m3gn_bench.leaderboard.campaign import Outcome
+from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder, find_record
+from m3gn_bench.sources import dataset_version, number_of_trajectories, regenerate
 from m3gn_bench.tasks import get_task
 
 Kind = Literal["shipped checkpoint", "trained again"]
@@ -70,13 +73,10 @@ def check_records(
             problems.append(f"{where}: its checkpoint does not ship with the project")
             continue
         model, description = load_checkpoint(folder)
-        if model.parameter_count() != record.parameters:
-            problems.append(
-                f"{where}: the model has {model.parameter_count()} parameters, not {record.parameters}"
-            )
         if description != record.checkpoint:
             problems.append(f"{where}: the shipped checkpoint is not the one that was recorded")
             continue
+        problems += [f"{where}: {problem}" for problem in _contradictions(record, model.parameter_count())]
         count = min(trajectories, len(record.keys))
         chosen = sorted({(offset * count + i) % len(record.keys) for i in range(count)})
         cases, hashes = regenerate(get_task(record.task), [record.keys[i] for i in chosen])
@@ -98,24 +98,56 @@ def check_records(
     return CheckReport.of(compared, problems)
 
 
-def compare_with_retrained(
-    recorded: Sequence[ResultRecord], again: Sequence[ResultRecord | None]
-) -> CheckReport:
-    """Compare records with those of the same runs made anew; None stands for a run that failed."""
+def _contradictions(record: ResultRecord, parameters: int) -> list[str]:
+    """What a record says of itself that is not so."""
+    task = get_task(record.task)
+    described = record.checkpoint
+    expected = {
+        "task, model, preset, seed": (
+            (record.task, record.model, record.preset, record.seed),
+            (described.task, described.config.model_name, described.config.preset, described.seed),
+        ),
+        "parameters": (record.parameters, parameters),
+        "dataset_version": (record.dataset_version, dataset_version(task)),
+        "context sizes": (tuple(result.context for result in record.results), task.context_sizes),
+    }
+    if not record.materials:
+        number = number_of_trajectories(task, record.tier, record.split)  # type: ignore[arg-type]
+        expected["number of trajectories"] = (len(record.keys), number)
+    return [f"{name}: {stated}, not {true}" for name, (stated, true) in expected.items() if stated != true]
+
+
+def compare_with_retrained(records: Sequence[ResultRecord], again: Sequence[Outcome]) -> CheckReport:
+    """Compare the records of some runs with what came of the same runs just now."""
     compared: list[Comparison] = []
     problems: list[str] = []
-    for record, new in zip(recorded, again, strict=True):
-        if new is None or (new.keys, new.parameters) != (record.keys, record.parameters):
-            problems.append(f"{record.task}/{record.name}: training again does not give the model on record")
+    for outcome in again:
+        run, new = outcome.run, outcome.record
+        where = f"{run.task}/{run.name}"
+        record = find_record(records, run.track, run.task, run.name)
+        if record is None:
+            problems.append(f"{where}: it is planned, but there is no record of it")
             continue
-        for result, other in zip(record.results, new.results, strict=True):
-            errors = zip(other.trajectory_mse, other.trajectory_mse_free_nodes, strict=True)
+        if new is None:
+            problems.append(f"{where}: training again failed: {outcome.error}")
+            continue
+        stated = {result.context: result for result in record.results}
+        if (new.keys, new.parameters) != (record.keys, record.parameters) or stated.keys() != {
+            result.context for result in new.results
+        }:
+            problems.append(f"{where}: its trajectories, contexts or parameters are not those on record")
+            continue
+        for result in new.results:
+            errors = zip(result.trajectory_mse, result.trajectory_mse_free_nodes, strict=True)
             compared += [
                 _comparison(
                     "trained again", record, result.context, index, both, new.trajectory_hashes[index]
                 )
                 for index, both in enumerate(errors)
             ]
+            over_time = stated[result.context].per_timestep_mse, result.per_timestep_mse
+            if not np.allclose(*over_time, rtol=TOLERANCES["trained again"], atol=0):
+                problems.append(f"{where}, context {result.context}: the error over time is another one")
     return CheckReport.of(compared, problems)
 
 
@@ -125,7 +157,10 @@ def _comparison(
     result = record.result(context)
     assert result is not None
     recorded = (result.trajectory_mse[index], result.trajectory_mse_free_nodes[index])
-    difference = max(abs(new - old) / old for new, old in zip(rederived, recorded, strict=True))
+    difference = max(
+        0.0 if new == old else abs(new - old) / max(new, old)
+        for new, old in zip(rederived, recorded, strict=True)
+    )
     return Comparison(
         kind=kind,
         track=record.track,

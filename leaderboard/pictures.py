@@ -43,10 +43,16 @@ def draw_overlays(
 
     context = middle(task.context_sizes)
     judge = next(record for record in records if record.model == "m3gn")
-    errors = judge.result(context)
-    assert errors is not None
-    key = judge.keys[int(np.argsort(errors.trajectory_mse)[len(errors.trajectory_mse) // 2])]
+    result = judge.result(context)
+    assert result is not None
     source = TrajectoryDataset(dataset, task.name, "test", tier)
+    errors = dict(zip(judge.keys, result.trajectory_mse, strict=True))
+    ranked = sorted(set(source.keys) & errors.keys(), key=lambda key: errors[key])
+    if not ranked:
+        raise ConfigError(
+            f"{dataset} holds none of the trajectories that {judge.task}/{judge.name} was scored on"
+        )
+    key = ranked[len(ranked) // 2]
     trajectory = source[source.keys.index(key)]
     case = case_from(task, source.metadata, trajectory, key)
     triangles = surface(trajectory.mesh)

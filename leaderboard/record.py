@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -13,11 +13,15 @@ from m3gn_bench.data import Materials
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
-from m3gn_bench.metrics import TrajectoryErrors, confidence_interval
+from m3gn_bench.metrics import TrajectoryErrors
 
 HOME = Path(__file__).parent
-RECORD_SCHEMA = 2
+RECORD_SCHEMA = 3
 HASH_DIGITS = 16  # of a trajectory's content hash, enough to tell trajectories apart
+# Names become parts of file names.
+Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
+Variant = Annotated[str, Field(pattern=r"^[\w .+=-]*$")]
+Error = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class ContextResult(Record):
@@ -27,7 +31,6 @@ class ContextResult(Record):
         context: number of context frames.
         mse: full-rollout MSE over all nodes, mean over trajectories.
         mse_free_nodes: the same without fixed nodes.
-        ci95: bootstrap interval of `mse`.
         per_timestep_mse: mean over trajectories, for every frame after the anchor.
         trajectory_mse: `mse` of every trajectory.
         trajectory_mse_free_nodes: `mse_free_nodes` of every trajectory.
@@ -36,21 +39,17 @@ class ContextResult(Record):
     context: int
     mse: float
     mse_free_nodes: float
-    ci95: tuple[float, float]
-    per_timestep_mse: tuple[float, ...]
-    trajectory_mse: tuple[float, ...]
-    trajectory_mse_free_nodes: tuple[float, ...]
+    per_timestep_mse: tuple[Error, ...]
+    trajectory_mse: tuple[Error, ...]
+    trajectory_mse_free_nodes: tuple[Error, ...]
 
     @model_validator(mode="after")
     def _summaries_follow_from_errors(self) -> Self:
         errors = np.array(self.trajectory_mse)
-        if not np.isfinite([*self.trajectory_mse, *self.trajectory_mse_free_nodes]).all():
-            raise ValueError("errors are not finite")
         derived: dict[str, tuple[Any, Any]] = {
             "mse": (self.mse, errors.mean()),
             "mse_free_nodes": (self.mse_free_nodes, np.mean(self.trajectory_mse_free_nodes)),
             "per_timestep_mse": (np.mean(self.per_timestep_mse), errors.mean()),
-            "ci95": (self.ci95, confidence_interval(errors)),
         }
         for name, (stated, expected) in derived.items():
             if not np.allclose(stated, expected, rtol=1e-6, atol=0):
@@ -72,7 +71,6 @@ class ContextResult(Record):
             context=context,
             mse=float(errors.mse.mean()),
             mse_free_nodes=float(errors.mse_free_nodes.mean()),
-            ci95=confidence_interval(errors.mse),
             per_timestep_mse=tuple(errors.per_timestep_mse.mean(0).tolist()),
             trajectory_mse=tuple(errors.mse.tolist()),
             trajectory_mse_free_nodes=tuple(errors.mse_free_nodes.tolist()),
@@ -87,16 +85,18 @@ class ResultRecord(Record):
         variant: what differs from the model's preset, in a word; empty where nothing does.
         materials: that trajectories were restricted to, in all splits; empty for all.
         dataset_version, dataset_hash: of the trajectories evaluated on.
-        commit: of the code, if it ran from a checkout.
+        commit: of the code that scored it, if that ran from a checkout.
+        machine: that scored it; empty if unknown.
+        evaluation_threads, evaluation_seconds: of torch, and wall time of all predictions.
         ships: whether the checkpoint is kept beside the records, so that anybody can re-derive the errors.
     """
 
     record_schema: int = RECORD_SCHEMA
-    track: str
-    task: str
-    model: str
-    preset: str
-    variant: str = ""
+    track: Name
+    task: Name
+    model: Name
+    preset: Name
+    variant: Variant = ""
     materials: Materials = Field(default={})
     seed: int
     parameters: int
@@ -108,7 +108,9 @@ class ResultRecord(Record):
     trajectory_hashes: tuple[str, ...]
     package_version: str
     commit: str | None
+    machine: str
     evaluation_device: str
+    evaluation_threads: int
     evaluation_seconds: float
     checkpoint: Checkpoint
     ships: bool
@@ -121,6 +123,11 @@ class ResultRecord(Record):
             lengths |= {len(result.trajectory_mse), len(result.trajectory_mse_free_nodes)}
         if len(lengths) != 1:
             raise ValueError(f"keys, hashes and errors differ in number: {sorted(lengths)}")
+        if len(set(self.keys)) != len(self.keys):
+            raise ValueError("a trajectory is there twice")
+        frames = {result.context + len(result.per_timestep_mse) for result in self.results}
+        if len(frames) > 1:
+            raise ValueError(f"trajectories have as many frames at every context size, not {sorted(frames)}")
         return self
 
     @property

@@ -94,18 +94,16 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
     lines = [
         "### Time per prediction",
         "",
-        "Milliseconds for a trajectory, mean over context sizes; one thread, batches of four, two processes at once.",
+        "Milliseconds for a trajectory, mean over context sizes; one thread, batches of four, while a campaign's other "
+        "processes have the other cores.",
         "",
         _row(["model", *(shown[name] for name in boards)]),
         _row(["---", *("--:" for _ in boards)]),
     ]
     for label in models:
         found = [rows.get(label) for rows in boards.values()]
-        lines.append(
-            _row(
-                [label, *("" if row is None else f"{1e3 * row.seconds_per_prediction:.3g}" for row in found)]
-            )
-        )
+        seconds = [None if row is None else row.seconds_per_prediction for row in found]
+        lines.append(_row([label, *("" if s is None else f"{1e3 * s:.3g}" for s in seconds)]))
     return "\n".join([*lines, ""])
 
 

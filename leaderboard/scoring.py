@@ -1,9 +1,10 @@
 """Score a trained model on a split: predict, measure, and put everything on record."""
 
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import torch
 
 from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.data import Materials, load_cases
@@ -11,6 +12,7 @@ from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, sto
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.record import HASH_DIGITS, ContextResult, ResultRecord
+from m3gn_bench.provenance import commit, machine
 from m3gn_bench.tasks import task_of_data
 from m3gn_bench.version import __version__
 
@@ -72,28 +74,12 @@ def score(
         keys=keys,
         trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),
         package_version=__version__,
-        commit=_commit(),
+        commit=commit(),
+        machine=machine(),
         evaluation_device="cpu",
+        evaluation_threads=torch.get_num_threads(),
         evaluation_seconds=seconds,
         checkpoint=described,
         ships=ships,
         results=tuple(ContextResult.from_errors(context, e) for context, e in errors.items()),
     )
-
-
-def _commit() -> str | None:
-    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
-    checkout = Path(__file__).parents[1]
-    if not (checkout / "pyproject.toml").is_file():
-        return None
-    git = ["git", "-C", str(checkout)]
-    try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        # What the leaderboard holds is what is being made: it changes no number.
-        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/*.md"]
-        status = subprocess.run(
-            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")

@@ -2,8 +2,11 @@
 
 from collections.abc import Sequence
 
+from pydantic import ValidationError
+
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import IMPORTED, Record
+from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
 from m3gn_bench.model import RunConfig, build_model, model_names
 from m3gn_bench.tasks import TASKS
@@ -38,6 +41,13 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     contexts = tuple(result.context for result in record.results)
     if contexts != TASKS[record.task].context_sizes:
         problems.append(f"context sizes are {contexts}, not the task's {TASKS[record.task].context_sizes}")
+    frames = {result.context + len(result.per_timestep_mse) for result in record.results}
+    if frames != {TASKS[record.task].frames}:
+        problems.append(
+            f"errors over time are of {sorted(frames)} frames, not of {TASKS[record.task].frames}"
+        )
+    if record.ships:
+        problems.append("ships is true, but only the project's own checkpoints ship")
     if find_record(board, record.track, record.task, record.name) is not None and not replace:
         problems.append(
             f"there is a record of {record.task}/{record.name} already; give --replace to replace it"
@@ -47,15 +57,11 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     if stated != (record.task, record.model, record.preset, record.seed):
         problems.append(f"the checkpoint's description is of another run: {'/'.join(map(str, stated))}")
     if record.model in model_names():
-        config = RunConfig.from_json(described.config.model_dump())
-        if config.hash() != described.config_hash:
-            problems.append("config_hash is not that of the configuration")
-        count = build_model(config, TASKS[record.task]).parameter_count()
-        if count != record.parameters:
-            problems.append(f"the model has {count} parameters with these settings, not {record.parameters}")
+        problems += _configuration_problems(record)
     else:
         remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
 
+    problems += _unequal_conditions(record, board)
     peers = [
         peer
         for peer in board
@@ -79,3 +85,46 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
                 "kind of processor they may ('m3gn-bench reproduce' tells whether by more than rounding)"
             )
     return Verdict(problems=tuple(problems), remarks=tuple(remarks))
+
+
+def _configuration_problems(record: ResultRecord) -> list[str]:
+    """What is wrong with the settings of a model that is installed here."""
+    described = record.checkpoint
+    try:
+        config = RunConfig.from_json(described.config.model_dump())
+    except (ConfigError, ValidationError) as error:
+        return [f"the configuration is none of {record.model}: {error}"]
+    problems = []
+    if config.hash() != described.config_hash:
+        problems.append("config_hash is not that of the configuration")
+    count = build_model(config, TASKS[record.task]).parameter_count()
+    if count != record.parameters:
+        problems.append(f"the model has {count} parameters with these settings, not {record.parameters}")
+    return problems
+
+
+def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    """In what a submission differs from the records that it would stand beside, where all must be equal."""
+
+    def conditions(of: ResultRecord) -> dict[str, object]:
+        settings = of.checkpoint.config.training
+        trained = of.checkpoint
+        budget = {name: settings.get(name) for name in ("minutes", "steps")} if trained.steps else {}
+        where = {"device": trained.device, "threads": trained.threads, "processes": trained.processes}
+        return {"tier": of.tier, "split": of.split} | budget | (where if trained.steps else {})
+
+    beside = [peer for peer in board if (peer.track, peer.task) == (record.track, record.task)]
+    own = conditions(record)
+    problems = []
+    for name, value in own.items():
+        theirs = {conditions(peer)[name] for peer in beside if name in conditions(peer)}
+        if theirs and value not in theirs:
+            problems.append(
+                f"{name} is {value}, but {', '.join(map(str, theirs))} for all others of track {record.track!r}"
+            )
+    for peer in beside:
+        same_row = (peer.model, peer.preset, peer.variant) == (record.model, record.preset, record.variant)
+        if same_row and peer.checkpoint.config_hash != record.checkpoint.config_hash:
+            problems.append(f"its settings are not those of {peer.name}; name what differs by a variant")
+            break
+    return problems

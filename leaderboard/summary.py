@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.metrics import bootstrap_means
 from m3gn_bench.tasks import TASKS
@@ -63,8 +64,10 @@ class Entry:
         return float(np.mean([record.checkpoint.minutes for record in self.records]))
 
     @property
-    def seconds_per_prediction(self) -> float:
-        """Wall time of one prediction, in batches, with one thread as in a campaign; mean over seeds and contexts."""
+    def seconds_per_prediction(self) -> float | None:
+        """Wall time of one prediction in batches, with one thread, mean over seeds and contexts; None if with more."""
+        if any(record.evaluation_threads > 1 for record in self.records):
+            return None
         predictions = len(self.records[0].keys) * len(self.contexts)
         return float(np.mean([record.evaluation_seconds for record in self.records])) / predictions
 
@@ -97,7 +100,7 @@ class Entry:
 
 
 def probability_of_less(
-    first: Entry, second: Entry, context: int, second_context: int | None = None
+    first: Entry, second: Entry, context: int, second_context: int | None = None, margin: float = 0.0
 ) -> float:
     """Probability that the first has the lower mean error, over resampled seeds and common trajectories.
 
@@ -105,13 +108,17 @@ def probability_of_less(
         first, second: two rows.
         context: number of context frames.
         second_context: of the second row, if another.
+        margin: by which share of the second's error the first may exceed it.
 
     Raises:
         ValueError: they were not scored on the same trajectories.
     """
     if (first.keys or first.records[0].keys) != (second.keys or second.records[0].keys):
         raise ValueError(f"{first.label} and {second.label} were scored on different trajectories")
-    ours, theirs = bootstrap_means([first.errors(context), second.errors(second_context or context)])
+    ours, theirs = bootstrap_means(
+        [first.errors(context), (1 + margin) * second.errors(second_context or context)],
+        same_runs=first.records == second.records,
+    )
     return float(np.mean(ours < theirs) + 0.5 * np.mean(ours == theirs))
 
 
@@ -125,13 +132,31 @@ def probability_below(row: Entry, yardstick: Entry | None, context: int) -> floa
 
 
 def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entry]:
-    """The rows of a board, best error at the middle context size first."""
+    """The rows of a board, best error at the middle context size first.
+
+    Like is compared with like: of records on several versions of the data only those on the latest count.
+
+    Raises:
+        BenchError: records are of different tiers or splits.
+    """
+    board = [record for record in records if (record.track, record.task) == (track, task)]
+    latest = max((_number(record) for record in board), default=())
     groups: dict[tuple[str, str, str], list[ResultRecord]] = {}
-    for record in records:
-        if (record.track, record.task) == (track, task):
+    for record in board:
+        if (record.tier, record.split) != (board[0].tier, board[0].split):
+            raise BenchError(
+                f"{track}/{task}: {record.name} was scored on {record.split} trajectories of tier {record.tier}, but "
+                f"{board[0].name} on {board[0].split} trajectories of tier {board[0].tier}; use another track"
+            )
+        if _number(record) == latest:
             groups.setdefault((record.model, record.preset, record.variant), []).append(record)
     found = [Entry(tuple(sorted(group, key=lambda r: r.seed))) for group in groups.values()]
     return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
+
+
+def _number(record: ResultRecord) -> tuple[int | str, ...]:
+    """The dataset's version as something that has an order."""
+    return tuple(int(part) if part.isdigit() else part for part in record.dataset_version.split("."))
 
 
 def titles(records: Sequence[ResultRecord]) -> dict[str, str]:

@@ -39,6 +39,7 @@ class Checkpoint(Record):
         validation_error: mean full-rollout MSE over context sizes of the kept weights; None if not trained.
         dataset_hash: content hash of the data trained on (training and validation split).
         processes: how many trained it together, each with a device and threads of its own.
+        commit: of the code that finished its training, if that ran from a checkout.
     """
 
     task: str
@@ -54,6 +55,7 @@ class Checkpoint(Record):
     threads: int
     processes: int = 1
     package_version: str
+    commit: str | None = None
     weights_sha256: str = ""
 
 

@@ -23,6 +23,7 @@ from m3gn_bench.data import Body, with_length
 from m3gn_bench.tasks import Task
 
 CONTACT_RADIUS = 0.3  # scaled units (paper, table of hyper-parameters)
+FAR_AWAY = 1e30  # scaled units
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,8 @@ def contact_pairs(body: Body, positions: Tensor, collider: Tensor) -> Tensor:
         # One more coordinate keeps bodies and moments apart, so a single tree serves all of them.
         group = np.arange(moments)[:, None] * bodies + body_of_point.cpu().numpy()
         flat = points.detach().cpu().numpy().astype(np.float64)
+        # What a diverging rollout has thrown to infinity touches nothing.
+        flat = np.where(np.isfinite(flat), flat, FAR_AWAY)
         apart = np.concatenate([flat, 2 * CONTACT_RADIUS * group[..., None]], axis=-1)
         return cKDTree(apart.reshape(-1, apart.shape[-1]))
 

@@ -14,7 +14,7 @@ import click
 from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, OnProgress, Report, table
 
 if TYPE_CHECKING:
-    from m3gn_bench.leaderboard.record import ResultRecord
+    from m3gn_bench.leaderboard.campaign import Outcome, PlannedRun
 
 
 BOARD = click.option(
@@ -177,6 +177,7 @@ def check_command(
     smoke, which are trained again.
     """
     from m3gn_bench.cpu import use_cpu
+    from m3gn_bench.leaderboard.campaign import PLANS, read_plan
     from m3gn_bench.leaderboard.check import (
         TOLERANCES,
         CheckReport,
@@ -202,9 +203,9 @@ def check_command(
         )
     compared, problems = list(found.compared), list(found.problems)
     if retrain:
-        recorded = [record for record in records if record.track == "smoke"]
+        planned = [run for run in read_plan(PLANS / "smoke.toml") if task_name in (None, run.task)]
         with report.progress("training again") as on_progress:
-            again = compare_with_retrained(recorded, _train_again(recorded, workers, on_progress))
+            again = compare_with_retrained(records, _train_again(planned, workers, on_progress))
         compared += again.compared
         problems += again.problems
     outcome = CheckReport.of(compared, problems)
@@ -238,30 +239,26 @@ def check_command(
     sys.exit(0 if outcome.ok else 1)
 
 
-def _train_again(
-    recorded: "Sequence[ResultRecord]", workers: int, on_progress: OnProgress
-) -> "list[ResultRecord | None]":
-    """New records of the runs of plan smoke, trained in an empty folder; None for those that failed."""
+def _train_again(planned: "Sequence[PlannedRun]", workers: int, on_progress: OnProgress) -> "list[Outcome]":
+    """What comes of some runs in an empty folder."""
     from m3gn_bench.generators.workers import run_jobs
-    from m3gn_bench.leaderboard.campaign import PLANS, Job, carry_out, read_plan
+    from m3gn_bench.leaderboard.campaign import Job, carry_out
     from m3gn_bench.sources import find_or_generate
     from m3gn_bench.tasks import get_task
 
-    names = {(record.task, record.name) for record in recorded}
-    planned = [run for run in read_plan(PLANS / "smoke.toml") if (run.task, run.name) in names]
-    made: dict[tuple[str, str], ResultRecord | None] = {}
+    made = []
     with tempfile.TemporaryDirectory() as name:
         empty = Path(name)
         files = {
             task: find_or_generate(get_task(task), "smoke", empty / "data", workers=workers)
             for task in {run.task for run in planned}
         }
-        jobs = [Job(run, files[run.task], empty / "runs", empty / "board") for run in planned]
+        jobs = [Job(run, files[run.task], empty / "runs") for run in planned]
         with closing(run_jobs(carry_out, jobs, workers)) as outcomes:
             for done, outcome in enumerate(outcomes, 1):
-                made[outcome.run.task, outcome.run.name] = outcome.record
+                made.append(outcome)
                 on_progress(done, len(planned))
-    return [made.get((record.task, record.name)) for record in recorded]
+    return made
 
 
 @leaderboard.command()
@@ -349,8 +346,7 @@ def campaign(
                         on_progress=on_progress,
                     )
             # Workers of a cluster start in folders of their own.
-            places = runs.absolute(), home.absolute()
-            jobs = (Job(run, files[run.task].absolute(), *places) for run in todo)
+            jobs = (Job(run, files[run.task].absolute(), runs.absolute()) for run in todo)
             training = run_jobs(carry_out, jobs, min(workers, len(todo)), executor=executor, shared=runs)
             with (
                 report.progress(f"training {len(todo)} runs") as on_progress,
@@ -358,6 +354,7 @@ def campaign(
             ):
                 on_progress(0, len(todo))
                 for done, outcome in enumerate(outcomes, 1):
+                    outcome.keep(home)
                     if outcome.error is not None:
                         problems[f"{outcome.run.task}/{outcome.run.name}"] = outcome.error
                     on_progress(done, len(todo))

@@ -31,10 +31,10 @@ class ContextConfig(ModelConfig):
     # Of the context network, where it needs fewer than the simulator; None: as many.
     context_message_passing_steps: int | None = Field(default=None, ge=1)
     latent_size: int = Field(default=64, ge=1)  # of the task description z
-    # Context pairs encoded per training step: the last one and some others at random; all of them when
-    # predicting. The maximum over time does not mind missing pairs, and encoding all would take most of a
-    # step's time.
-    training_context_pairs: int | None = Field(default=None, ge=1)
+    # Context pairs encoded per training step: the last one and others at random, at most so many together; all of
+    # them when predicting. The maximum over time does not mind missing pairs, and encoding all would take most of
+    # a step's time.
+    max_training_context_pairs: int | None = Field(default=None, ge=1)
     # Standard deviation of noise on the frames that the context network reads, scaled units, in training and
     # prediction (paper, appendix: robustness to noisy observations). The anchor itself stays exact.
     context_noise: float = Field(default=0.0, ge=0)
@@ -90,10 +90,14 @@ class ContextEncoder(nn.Module):
     def choose_pairs(self, size: int, rng: np.random.Generator | None) -> Tensor:
         """The frames t whose pair (t, t + 1) is read, counted from 0."""
         last = size - 2
-        if rng is None or self.config.training_context_pairs is None:
+        if rng is None or self.config.max_training_context_pairs is None:
             return torch.arange(last + 1)
-        others = rng.permutation(last)[: self.config.training_context_pairs - 1]
+        others = rng.permutation(last)[: self.pairs_to_read(self.config.max_training_context_pairs, rng) - 1]
         return torch.from_numpy(np.append(np.sort(others), last))
+
+    def pairs_to_read(self, most: int, rng: np.random.Generator) -> int:
+        """How many, drawn anew for every step: descriptions by few pairs and by more are to be of one kind."""
+        return int(rng.integers(1, most + 1))
 
     def encode(self, context: Context, pairs: Tensor, velocity_scale: Tensor) -> Tensor:
         """What the network says of every pair, shape [pairs, nodes + collider_nodes, outputs]."""

@@ -54,8 +54,9 @@ def concatenate(parts: list[TrajectoryErrors]) -> TrajectoryErrors:
     )
 
 
-def confidence_interval(errors: np.ndarray) -> tuple[float, float]:
+def confidence_interval(trajectory_errors: Sequence[float]) -> tuple[float, float]:
     """95 % bootstrap interval (percentile) of the mean of per-trajectory errors, the same at every call."""
+    errors = np.asarray(trajectory_errors)
     if len(errors) < 2 or np.ptp(errors) == 0:
         return float(errors.mean()), float(errors.mean())
     interval = bootstrap(
@@ -70,7 +71,7 @@ def confidence_interval(errors: np.ndarray) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def bootstrap_means(errors: Sequence[np.ndarray]) -> np.ndarray:
+def bootstrap_means(errors: Sequence[np.ndarray], *, same_runs: bool = False) -> np.ndarray:
     """Means over resampled seeds and trajectories, the same at every call.
 
     Percentiles of a row are a model's interval. Trajectories are drawn for all models together and seeds for each
@@ -78,6 +79,7 @@ def bootstrap_means(errors: Sequence[np.ndarray]) -> np.ndarray:
 
     Args:
         errors: of each model, shape [seeds, trajectories]; all on the same trajectories.
+        same_runs: they are all of the same trained models (at several context sizes), so seeds are drawn together, too.
 
     Returns:
         Shape [models, BOOTSTRAP_RESAMPLES].
@@ -88,4 +90,5 @@ def bootstrap_means(errors: Sequence[np.ndarray]) -> np.ndarray:
         return rng.multinomial(items, np.full(items, 1 / items), BOOTSTRAP_RESAMPLES) / items
 
     trajectories = shares(errors[0].shape[1])
-    return np.stack([((shares(len(e)) @ e) * trajectories).sum(1) for e in errors])
+    seeds = [shares(len(errors[0]))] * len(errors) if same_runs else [shares(len(e)) for e in errors]
+    return np.stack([((s @ e) * trajectories).sum(1) for s, e in zip(seeds, errors, strict=True)])

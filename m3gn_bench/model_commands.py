@@ -210,6 +210,7 @@ def evaluate(
     from m3gn_bench.errors import CheckpointError, ConfigError
     from m3gn_bench.leaderboard.record import checkpoint_folder, find_record, read_records, write_record
     from m3gn_bench.leaderboard.scoring import score
+    from m3gn_bench.metrics import confidence_interval
     from m3gn_bench.model import get_model_class, model_names
     from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import TASKS, get_task
@@ -287,7 +288,7 @@ def evaluate(
                 "context": r.context,
                 "mse": r.mse,
                 "mse_free_nodes": r.mse_free_nodes,
-                "ci95": r.ci95,
+                "ci95": confidence_interval(r.trajectory_mse),
                 "per_timestep_mse": r.per_timestep_mse,
                 "trajectories": len(record.keys),
                 "recorded_mse": reference.mse_over(r.context, record.keys)

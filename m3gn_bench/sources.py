@@ -13,7 +13,7 @@ from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.file import find_dataset, open_file, read_metadata
 from m3gn_bench.datasets.plugins import leave_out
-from m3gn_bench.datasets.schema import SPLITS, Split, parse_key
+from m3gn_bench.datasets.schema import SPLITS, Split, parse_key, tier_sizes
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.tasks import TASKS, Task, task_of_data
 
@@ -79,6 +79,21 @@ def given(path: Path, name: str) -> tuple[Task, str]:
     with open_file(path) as file:
         metadata = read_metadata(file)
     return task_of_data(name, metadata), metadata.tier
+
+
+def number_of_trajectories(task: Task, tier: str, split: Split) -> int:
+    """How many trajectories of a split take part in a task in a tier."""
+    from m3gn_bench.generators.scene import get_scene
+
+    scene = get_scene(task.scene)
+    return scene.task_size(task.name, split, tier_sizes(tier, scene.paper_sizes)[split])
+
+
+def dataset_version(task: Task) -> str:
+    """The version of the dataset that the task's scene makes."""
+    from m3gn_bench.generators.scene import get_scene
+
+    return get_scene(task.scene).dataset_version
 
 
 def regenerate(task: Task, keys: Sequence[str]) -> tuple[list[Case], list[str]]:

@@ -20,6 +20,7 @@ from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Body, Case, Context, case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
+from m3gn_bench.provenance import machine
 from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
 from m3gn_bench.tasks import Task
 
@@ -96,7 +97,6 @@ def measure(
         on_progress: called with the numbers of cells done and in total.
     """
     from m3gn_bench.generators.extremes import extremes_of
-    from m3gn_bench.generators.generate import machine
     from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.generators.workers import run_jobs
     from m3gn_bench.version import __version__

@@ -25,6 +25,7 @@ from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
+from m3gn_bench.provenance import machine
 from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
 from m3gn_bench.tasks import Task
 
@@ -292,7 +293,7 @@ class Bench:
     """The measurements of one task and what follows from them."""
 
     def __init__(self, task: Task, scene: "Scene", knobs: "Knobs") -> None:
-        from m3gn_bench.generators.generate import draw, machine
+        from m3gn_bench.generators.generate import draw
 
         self.task, self.scene, self.knobs = task, scene, knobs
         self.machine = machine()

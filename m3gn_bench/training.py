@@ -33,6 +33,7 @@ from m3gn_bench.distributed import ALONE, Group
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.model import Model, RunConfig, build_model
+from m3gn_bench.provenance import commit
 from m3gn_bench.tasks import Task
 from m3gn_bench.version import __version__
 
@@ -116,7 +117,9 @@ def train(
             )
         return read_description(out)
     if not model.is_learned:
-        checkpoint = Checkpoint(**describe, steps=0, best_step=0, minutes=0.0, validation_error=None)
+        checkpoint = Checkpoint(
+            **describe, steps=0, best_step=0, minutes=0.0, validation_error=None, commit=commit()
+        )
         return _finish(out, model.state_dict(), checkpoint, group)
     require_budget(config, model.is_learned)
 
@@ -280,6 +283,7 @@ class Run:
             best_step=progress.best_step,
             minutes=progress.minutes,
             validation_error=progress.best_error,
+            commit=commit(),
         )
 
     def save(self) -> None:

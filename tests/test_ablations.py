@@ -228,7 +228,7 @@ def test_limits_of_bayesian_aggregation() -> None:
 @pytest.mark.parametrize(("size", "read"), [(12, 4), (12, 2), (3, 4), (2, 2)])
 def test_weights_of_random_pairs_estimate_the_sum_over_all(size: int, read: int) -> None:
     """In the mean over draws every pair counts once, the last one always."""
-    encoder = encoder_of(BayesianEncoder, "sheet_deformation", training_context_pairs=read)
+    encoder = encoder_of(BayesianEncoder, "sheet_deformation", max_training_context_pairs=read)
     rng, draws = np.random.default_rng(0), 2000
     counts = np.zeros(size - 1)
     for _ in range(draws):

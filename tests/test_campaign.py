@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,9 @@ from m3gn_bench.baselines.mgn import MeshGraphNet
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cli import run
 from m3gn_bench.errors import ConfigError
-from m3gn_bench.leaderboard.campaign import PLANS, Job, carry_out, read_plan
+from m3gn_bench.leaderboard.campaign import PLANS, Job, Outcome, carry_out, read_plan
 from m3gn_bench.leaderboard.check import compare_with_retrained
-from m3gn_bench.leaderboard.record import checkpoint_folder, read_records
+from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
 HEAD = 'track = "trial"\ntier = "smoke"\n'
@@ -96,6 +97,31 @@ def test_a_failing_run_does_not_stop_the_others(
     assert "learning_rate" in problem
 
 
+def test_a_defect_of_one_run_is_told_and_not_in_the_way(
+    smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (planned,) = read_plan(write(tmp_path, GRID))
+    monkeypatch.setattr(MeshGraphNet, "training_loss", lambda self, case, rng: 1 / 0)
+    outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
+    assert outcome.record is None
+    assert "ZeroDivisionError" in str(outcome.error)
+
+
+def test_shipping_later_is_something_to_do(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The training is not done again, but its checkpoint comes to lie beside the record."""
+    carry(campaign(write(tmp_path, GRID), smoke_file.parent), capsys)
+    folder = checkpoint_folder("sheet_deformation", "mgn", "smoke", 0, tmp_path / "home")
+    assert not folder.exists()
+    trained = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("weights.safetensors")}
+    plan = write(tmp_path, GRID + "shipped_seeds = [0]\n")
+    _, outcome = carry(campaign(plan, smoke_file.parent), capsys)
+    assert outcome["counts"] == {"done": 1, "outdated": 0, "to do": 0}
+    assert load_checkpoint(folder)
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "runs").rglob("weights.safetensors")} == trained
+
+
 def test_a_killed_campaign_goes_on(
     smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,11 +136,13 @@ def test_a_killed_campaign_goes_on(
             assert process.poll() is None
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
+    finished = {path: path.stat().st_mtime_ns for path in (tmp_path / "home").rglob("*-s?.json")}
     deadline = time.monotonic() + 30
     while _alive(process.pid) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not _alive(process.pid)
     assert carry(campaign(plan, smoke_file.parent), capsys)[0] == 0
+    assert all(path.stat().st_mtime_ns == time for path, time in finished.items())
     undisturbed = tmp_path / "undisturbed"
     undisturbed.mkdir()
     carry(campaign(write(undisturbed, grid), smoke_file.parent), capsys)
@@ -148,6 +176,7 @@ def _alive(session: int) -> bool:
         (HEAD + GRID + GRID, "twice"),
         (HEAD.replace("smoke", "small") + GRID, "unknown 'small'"),
         (HEAD + GRID + 'variant = "a/b"\n', r"runs.0.variant"),
+        (HEAD + GRID + 'variant = "a"\nshipped_seeds = [0]\n', "table 1: checkpoints of a variant"),
     ],
 )
 def test_a_wrong_plan_is_refused(tmp_path: Path, text: str, reason: str) -> None:
@@ -159,7 +188,7 @@ def test_a_wrong_plan_is_refused(tmp_path: Path, text: str, reason: str) -> None
 
 def test_an_unknown_material_is_a_problem_of_its_run(smoke_file: Path, tmp_path: Path) -> None:
     (planned,) = read_plan(write(tmp_path, GRID + "materials = { density = [1] }\n"))
-    outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs", tmp_path / "home"))
+    outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
     assert outcome.record is None
     assert "unknown material parameter 'density'; known: youngs_modulus" in str(outcome.error)
 
@@ -186,12 +215,13 @@ def test_planted_error_in_training_is_found(
     """Training again gives the same errors, and others if the model's loss is not what it was."""
     (planned,) = read_plan(write(tmp_path, GRID.replace("steps = 3", "steps = 12")))
 
-    def trained(name: str) -> object:
-        job = Job(planned, smoke_file, tmp_path / name / "runs", tmp_path / name / "home")
-        return carry_out(job).record
+    def trained(name: str) -> Outcome:
+        return carry_out(Job(planned, smoke_file, tmp_path / name))
 
-    recorded = trained("first")
-    same = compare_with_retrained([recorded], [trained("second")])  # type: ignore[list-item]
+    recorded = trained("first").record
+    assert recorded is not None
+    second = trained("second")
+    same = compare_with_retrained([recorded], [second])
     assert same.ok
     assert all(c.relative_difference == 0 and c.same_trajectory for c in same.compared)
 
@@ -199,5 +229,19 @@ def test_planted_error_in_training_is_found(
     monkeypatch.setattr(
         MeshGraphNet, "training_loss", lambda self, case, rng: original(self, case, rng).sqrt()
     )
-    assert not compare_with_retrained([recorded], [trained("third")]).ok  # type: ignore[list-item]
-    assert not compare_with_retrained([recorded], [None]).ok  # type: ignore[list-item]
+    assert not compare_with_retrained([recorded], [trained("third")]).ok
+
+    def problem(record: ResultRecord | None, outcome: Outcome) -> str:
+        found = compare_with_retrained([] if record is None else [record], [outcome])
+        assert not found.ok
+        return found.problems[0]
+
+    assert "no record" in problem(None, second)
+    assert "failed: it did" in problem(recorded, replace(second, record=None, error="it did"))
+    fewer = recorded.model_copy(update={"results": recorded.results[1:]})
+    assert "contexts" in problem(fewer, second)
+    reversed_in_time = tuple(
+        r.model_copy(update={"per_timestep_mse": r.per_timestep_mse[::-1]}) for r in recorded.results
+    )
+    late = recorded.model_copy(update={"results": reversed_in_time})
+    assert "over time" in problem(late, second)

@@ -63,7 +63,9 @@ def made_up(
         trajectory_hashes=("0",) * len(keys),
         package_version="0",
         commit=None,
+        machine="",
         evaluation_device="cpu",
+        evaluation_threads=1,
         evaluation_seconds=1.0,
         checkpoint=checkpoint,
         ships=False,
@@ -79,8 +81,13 @@ def verdict_of(monkeypatch: pytest.MonkeyPatch, records: list[ResultRecord], *co
     return row.split("|")[2].strip()
 
 
-def below(better: str, worse: str, **options: int) -> Comparison:
-    return Comparison("compact", "sheet_deformation", better, worse, **options)
+def below(better: str, worse: str, **options: float) -> Comparison:
+    return Comparison("compact", "sheet_deformation", better, worse, **options)  # type: ignore[arg-type]
+
+
+def rows(seeds: int = 3, **errors: float) -> list[ResultRecord]:
+    """Models of such errors, with so many seeds each."""
+    return [made_up(model, error, seed=seed) for model, error in errors.items() for seed in range(seeds)]
 
 
 @pytest.mark.parametrize(
@@ -88,21 +95,45 @@ def below(better: str, worse: str, **options: int) -> Comparison:
     [(1.0, 2.0, "reproduced"), (2.0, 1.0, "not reproduced"), (1.0, 1.001, "undecided")],
 )
 def test_verdicts(monkeypatch: pytest.MonkeyPatch, first: float, second: float, verdict: str) -> None:
-    records = [
-        made_up(model, error, seed=seed) for model, error in (("a", first), ("b", second)) for seed in (0, 1)
-    ]
-    assert verdict_of(monkeypatch, records, below("a", "b")) == verdict
+    assert verdict_of(monkeypatch, rows(a=first, b=second), below("a", "b")) == verdict
+
+
+@pytest.mark.parametrize(
+    ("first", "verdict"), [(1.0, "reproduced"), (1.1, "undecided"), (1.3, "not reproduced")]
+)
+def test_no_worse_allows_a_margin(monkeypatch: pytest.MonkeyPatch, first: float, verdict: str) -> None:
+    """Equal errors are what "as good as" means, and what is clearly worse is not."""
+    comparison = below("a", "b", margin=0.1)
+    assert verdict_of(monkeypatch, rows(a=first, b=1.0), comparison) == verdict
+    assert verdict_of(monkeypatch, rows(a=1.0, b=1.0), below("a", "b")) == "undecided"
 
 
 def test_what_holds_in_part_or_has_no_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    records = [made_up("a", 1.0), made_up("b", 2.0), made_up("c", 0.5)]
-    assert verdict_of(monkeypatch, records, below("a", "b"), below("a", "c")) == "reproduced in part"
-    assert verdict_of(monkeypatch, records, below("a", "b"), below("a", "d")) == "not measured yet"
+    records = rows(a=1.0, b=2.0, c=0.5)
+    mixed = verdict_of(monkeypatch, records, below("a", "b"), below("a", "c"))
+    assert mixed == "reproduced in part (1 contradicted, 1 holds)"
+    missing = verdict_of(monkeypatch, records, below("a", "c"), below("a", "d"))
+    assert missing == "not measured yet (1 contradicted, 1 not measured yet)"
+    assert verdict_of(monkeypatch, rows(2, a=1.0, b=2.0), below("a", "b")) == "not measured yet"
+    assert verdict_of(monkeypatch, records) == "not testable here"
+
+
+def test_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    records = rows(a=1.0, b=1.0)
+    slow = [r.model_copy(update={"evaluation_seconds": 2.0}) if r.model == "b" else r for r in records]
+    faster = below("a", "b", of_time=True)
+    assert verdict_of(monkeypatch, slow, faster) == "reproduced"
+    assert verdict_of(monkeypatch, slow, below("b", "a", of_time=True)) == "not reproduced"
+    assert verdict_of(monkeypatch, records, faster) == "undecided"
+    threads = [r.model_copy(update={"evaluation_threads": 2}) for r in slow]
+    assert verdict_of(monkeypatch, threads, faster) == "not measured yet"
 
 
 def test_contexts_and_common_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     """A model against itself at another context size, and rows that share only some trajectories."""
-    records = [made_up("a", 1.0), made_up("b", 2.0, keys=KEYS[3:9], variant="some")]
+    # Seeds differ far more than contexts do, but each of them is better with more context.
+    records = [made_up("a", error, seed=seed) for seed, error in enumerate((1.0, 4.0, 16.0))]
+    records += [made_up("b", 32.0, seed=seed, keys=KEYS[3:9], variant="some") for seed in range(3)]
     assert verdict_of(monkeypatch, records, below("a", "a", context=10, worse_context=2)) == "reproduced"
     assert verdict_of(monkeypatch, records, below("a", "a", context=2, worse_context=10)) == "not reproduced"
     assert verdict_of(monkeypatch, records, below("a", "b (some)")) == "reproduced"
@@ -120,7 +151,7 @@ def test_findings_name_what_exists() -> None:
         for run in read_plan(Path(claims.__file__).parent / "plans" / f"{name}.toml")
     }
     for claim in claims.CLAIMS:
-        assert claim.comparisons
+        assert claim.comparisons or claim.remark.startswith("Not testable")
         for comparison in claim.comparisons:
             for row in (comparison.better, comparison.worse):
                 assert (comparison.track, comparison.task, row) in planned, (claim.finding, row)
@@ -146,7 +177,9 @@ def test_pictures_of_trained_models(smoke_file: Path, tmp_path: Path) -> None:
         'track = "compact"\ntier = "smoke"\n[[runs]]\ntasks = ["sheet_deformation"]\nmodels = ["m3gn", "mgn"]\n'
         'preset = "smoke"\nsteps = 2\nshipped_seeds = [0]\n'
     )
-    outcomes = [carry_out(Job(run, smoke_file, tmp_path / "runs", tmp_path)) for run in read_plan(plan)]
+    outcomes = [carry_out(Job(run, smoke_file, tmp_path / "runs")) for run in read_plan(plan)]
+    for outcome in outcomes:
+        outcome.keep(tmp_path)
     records = [outcome.record for outcome in outcomes if outcome.record is not None]
     task = get_task("sheet_deformation")
     overlays = draw_overlays(records, task, smoke_file, "smoke", tmp_path)

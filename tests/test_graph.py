@@ -114,6 +114,13 @@ def test_no_contact_at_all() -> None:
     assert pairs.dtype == torch.long
 
 
+def test_what_diverges_touches_nothing() -> None:
+    """A rollout that blows up goes on to its end, where its error is named."""
+    places = torch.tensor([[[0.0, 0.1], [0.0, np.inf], [np.nan, 0.0], [0.0, 3e38]]])
+    pairs = contact_pairs(loose_body(4, 2, 2), places, torch.zeros(1, 2, 2))
+    assert as_set(pairs) == {(0, 4), (0, 5)}
+
+
 def test_number_of_neighbours_is_not_capped() -> None:
     """Every one of 300 mesh nodes touches every one of 150 collider nodes."""
     rng = np.random.default_rng(0)

@@ -2,8 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from m3gn_bench.cli import run
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.generators import sheet_deformation
 from m3gn_bench.generators.scene import get_scene
-from m3gn_bench.leaderboard import check, record, render, submission, summary
+from m3gn_bench.leaderboard import campaign, check, record, render, submission, summary
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
 from m3gn_bench.metrics import TrajectoryErrors
 from m3gn_bench.tasks import get_task
@@ -73,14 +74,14 @@ def test_planted_error_in_a_record_is_found(use_board: Path) -> None:
     result = wrong["results"][1]
     for name in ("mse", "mse_free_nodes"):
         result[name] *= 1.01
-    for name in ("ci95", "per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
+    for name in ("per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
         result[name] = [1.01 * value for value in result[name]]
     report = run_check([ResultRecord.model_validate(wrong), *records[1:]])
     assert not report.ok
     assert sum(not c.ok for c in report.compared) == 1
 
 
-@pytest.mark.parametrize("name", ["mse", "mse_free_nodes", "ci95", "per_timestep_mse", "trajectory_mse"])
+@pytest.mark.parametrize("name", ["mse", "mse_free_nodes", "per_timestep_mse", "trajectory_mse"])
 def test_numbers_that_do_not_follow_from_the_errors_are_refused(board: Path, name: str) -> None:
     wrong = read_records(board)[0].model_dump()
     value = wrong["results"][1][name]
@@ -133,6 +134,79 @@ def test_planted_error_in_a_model_is_found(use_board: Path, monkeypatch: pytest.
     assert not report.ok
 
 
+def fewer(values: dict[str, Any], count: int) -> dict[str, Any]:
+    """Only the trajectories of lowest error, consistent in itself."""
+    kept = np.argsort(values["results"][1]["trajectory_mse"])[:count]
+    for name in ("keys", "trajectory_hashes"):
+        values[name] = [values[name][place] for place in kept]
+    for result in values["results"]:
+        for name in ("trajectory_mse", "trajectory_mse_free_nodes"):
+            result[name] = [result[name][place] for place in kept]
+        mean = float(np.mean(result["trajectory_mse"]))
+        result["per_timestep_mse"] = [mean * x / result["mse"] for x in result["per_timestep_mse"]]
+        result["mse"], result["mse_free_nodes"] = mean, float(np.mean(result["trajectory_mse_free_nodes"]))
+    return values
+
+
+@pytest.mark.parametrize(
+    ("plant", "reason"),
+    [
+        (lambda values: fewer(values, 2), "number of trajectories: 2, not 4"),
+        (lambda values: values | {"dataset_version": "9.9"}, "dataset_version: 9.9"),
+        (lambda values: values | {"parameters": 7}, "parameters: 7"),
+        (lambda values: values | {"seed": 3}, "task, model, preset, seed"),
+        (lambda values: values | {"results": values["results"][1:]}, "context sizes"),
+    ],
+)
+def test_what_a_record_says_wrongly_of_itself_is_found(
+    use_board: Path, monkeypatch: pytest.MonkeyPatch, plant: Callable[[Any], Any], reason: str
+) -> None:
+    """Every number that is left is right, so comparing them would not tell."""
+    honest = next(r for r in read_records(use_board) if r.model == "mgn")
+    folder = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=use_board)
+    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: folder)
+    report = run_check([ResultRecord.model_validate(plant(honest.model_dump()))])
+    assert not report.ok
+    assert all(comparison.ok for comparison in report.compared)
+    (problem,) = report.problems
+    assert reason in problem
+
+
+@pytest.mark.parametrize("planted", [False, True])
+def test_the_command_fails_where_a_record_does(
+    board: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    planted: bool,
+) -> None:
+    """By its exit code, which CI goes by; also where a planned run has no record."""
+    home = tmp_path / "home"
+    shutil.copytree(board, home)
+    plan = tmp_path / "smoke.toml"
+    model = "stand_still" if not planted else "constant_velocity"
+    plan.write_text(
+        'track = "test"\ntier = "smoke"\n[[runs]]\ntasks = ["sheet_deformation"]\n'
+        f'models = ["{model}"]\npreset = "smoke"\nshipped_seeds = [0]\n'
+    )
+    monkeypatch.setattr(campaign, "PLANS", tmp_path)
+    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=home))
+    monkeypatch.setattr(record, "read_records", lambda: read_records(home))
+    if planted:
+        wrong = with_errors(read_records(home)[0], 0, 1.01)
+        write_record(wrong, home)
+    with pytest.raises(SystemExit) as stop:
+        run(["leaderboard", "check", "--trajectories", "1", "--offset", "0", "--workers", "1", "--json"])
+    outcome = json.loads(capsys.readouterr().out)
+    assert (stop.value.code, outcome["ok"]) == ((1, False) if planted else (0, True))
+    assert {c["kind"] for c in outcome["compared"]} == {
+        "shipped checkpoint",
+        *(() if planted else ("trained again",)),
+    }
+    assert sum(not c["ok"] for c in outcome["compared"]) == (3 if planted else 0)
+    assert ["no record" in problem for problem in outcome["problems"]] == [True] * planted
+
+
 def test_missing_checkpoint_and_empty_board_are_problems(
     use_board: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +224,6 @@ def test_record_says_where_its_numbers_come_from(board: Path) -> None:
     )
     for result in stored.results:
         assert result.mse == pytest.approx(np.mean(result.trajectory_mse), rel=1e-6)
-        assert result.ci95[0] <= result.mse <= result.ci95[1]
         assert result.mse_free_nodes == pytest.approx(result.mse * 225 / 169, rel=1e-5)  # 56 clamped nodes
         assert len(result.per_timestep_mse) == 51 - result.context
         assert np.mean(result.per_timestep_mse) == pytest.approx(result.mse, rel=1e-6)
@@ -194,7 +267,7 @@ def with_errors(record: ResultRecord, seed: int, factor: float) -> ResultRecord:
     for result in values["results"]:
         for name in ("mse", "mse_free_nodes"):
             result[name] *= factor
-        for name in ("ci95", "per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
+        for name in ("per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
             result[name] = [factor * value for value in result[name]]
     return ResultRecord.model_validate(values)
 
@@ -224,6 +297,11 @@ def test_shipped_records_and_page_agree(capsys: pytest.CaptureFixture[str]) -> N
     assert stop.value.code == 0, capsys.readouterr().out
     shipped = read_records()
     assert shipped
+    rows: dict[tuple[str, ...], set[str]] = {}
+    for stored in shipped:
+        row = stored.track, stored.task, stored.model, stored.preset, stored.variant
+        rows.setdefault(row, set()).add(stored.checkpoint.config_hash)
+    assert all(len(hashes) == 1 for hashes in rows.values())  # seeds of a row have the same settings
     folders = set()
     for stored in shipped:
         if stored.ships:
@@ -238,6 +316,35 @@ def test_shipped_records_are_of_these_datasets() -> None:
     """A change of a scene asks for new records."""
     for stored in read_records():
         assert stored.dataset_version == get_scene(get_task(stored.task).scene).dataset_version, stored.name
+
+
+Changes = Callable[[ResultRecord], dict[str, Any]]
+
+
+def checkpoint(**changes: object) -> Changes:
+    return lambda record: {"track": "test", "checkpoint": record.checkpoint.model_copy(update=changes)}
+
+
+def training(**changes: object) -> Changes:
+    def change(record: ResultRecord) -> dict[str, Any]:
+        config = record.checkpoint.config
+        changed = config.model_copy(update={"training": config.training | changes})
+        return checkpoint(config=changed)(record)
+
+    return change
+
+
+def per_timestep(longer: int) -> Changes:
+    """Errors over so many frames more."""
+
+    def change(record: ResultRecord) -> dict[str, Any]:
+        return {
+            "results": tuple(
+                r.model_copy(update={"per_timestep_mse": r.per_timestep_mse[:longer]}) for r in record.results
+            )
+        }
+
+    return change
 
 
 @pytest.fixture
@@ -270,13 +377,49 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         ({"keys": ("test_00003", "test_00002", "test_00001", "test_00000")}, "other trajectories"),
         ({"track": "test"}, "already"),
         ({"record_schema": 1}, "record_schema"),
+        ({"ships": True}, "only the project's own checkpoints ship"),
+        ({"track": "test", "seed": 1, "tier": "quick"}, "tier is quick, but smoke"),
+        (training(steps=600), "steps is 600, but 3"),
+        (checkpoint(device="cuda"), "device is cuda, but cpu"),
+        (checkpoint(config_hash="0"), "config_hash is not that"),
+        (training(optimizer="sgd"), "the configuration is none of mgn"),
+        (per_timestep(-1), "errors over time are of"),
     ],
 )
 def test_what_is_wrong_with_a_submission_is_named(
-    board: Path, submitted: ResultRecord, changes: dict[str, object], reason: str
+    board: Path, submitted: ResultRecord, changes: Any, reason: str
 ) -> None:
+    if callable(changes):
+        changes = changes(submitted)
     verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
     assert any(reason in problem for problem in verdict.problems), verdict
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"variant": "x/../../evil"}, "variant"),
+        ({"track": "../evil"}, "track"),
+        ({"keys": ("test_00000",) * 4}, "twice"),
+    ],
+)
+def test_records_that_cannot_be_are_refused(
+    submitted: ResultRecord, changes: dict[str, object], reason: str
+) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        ResultRecord.model_validate(submitted.model_dump() | changes)
+    with pytest.raises(ValidationError, match="greater than or equal"):
+        with_errors(submitted, 0, -1.0)
+
+
+def test_a_board_compares_like_with_like(board: Path) -> None:
+    """Older data do not count beside newer ones, and other trajectories are refused."""
+    one, other = read_records(board)
+    old = one.model_copy(update={"dataset_version": "1.9"})
+    new = other.model_copy(update={"dataset_version": "1.10"})
+    assert [row.label for row in summary.entries([old, new], one.track, one.task)] == [new.model]
+    with pytest.raises(BenchError, match="tier quick"):
+        summary.entries([one, other.model_copy(update={"tier": "quick"})], one.track, one.task)
 
 
 def test_a_submission_on_other_bits_or_by_an_unknown_model_is_remarked(

@@ -26,7 +26,7 @@ from model_cases import (
 from m3gn_bench.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from m3gn_bench.data import Case, join
 from m3gn_bench.errors import CheckpointError
-from m3gn_bench.m3gn import M3GN, TrajectorySimulator
+from m3gn_bench.m3gn import M3GN, ContextConfig, ContextEncoder, TrajectorySimulator
 from m3gn_bench.model import Model, build_model, get_model_class, load_preset, model_names
 from m3gn_bench.tasks import TASKS, get_task
 
@@ -291,6 +291,20 @@ def test_random_context_pairs_are_a_subset_of_all() -> None:
         )
     assert (everything - some).min() > -1e-5
     assert (everything - some).max() > 1e-4
+
+
+def test_training_reads_one_to_so_many_pairs() -> None:
+    """The last one always, the others and their number at random; prediction reads all."""
+    config = ContextConfig(width=8, message_passing_steps=1, latent_size=4, max_training_context_pairs=3)
+    encoder = ContextEncoder(get_task("sheet_deformation"), config)
+    rng, draws = np.random.default_rng(0), 600
+    chosen = [tuple(encoder.choose_pairs(10, rng).tolist()) for _ in range(draws)]
+    assert all(pairs[-1] == 8 and list(pairs) == sorted(set(pairs)) for pairs in chosen)
+    for number in (1, 2, 3):
+        assert sum(len(pairs) == number for pairs in chosen) == pytest.approx(draws / 3, abs=50)
+    assert {pairs[0] for pairs in chosen} == set(range(9))
+    assert encoder.choose_pairs(10, None).tolist() == list(range(9))
+    assert encoder.choose_pairs(2, rng).tolist() == [0]
 
 
 @every_kind

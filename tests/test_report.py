@@ -50,7 +50,9 @@ def home(tmp_path_factory: pytest.TempPathFactory, smoke_file: Path) -> Path:
     folder = tmp_path_factory.mktemp("board")
     (folder / "plan.toml").write_text(PLAN)
     for planned in read_plan(folder / "plan.toml"):
-        assert carry_out(Job(planned, smoke_file, folder / "runs", folder)).error is None
+        outcome = carry_out(Job(planned, smoke_file, folder / "runs"))
+        assert outcome.error is None
+        outcome.keep(folder)
     for model, error in (("egno", 3e-4), ("mango", 2e-5), ("stand_still", 1e-1)):
         write_record(made_up(model, error), folder)
     write_record(made_up("mango", 3e-5, seed=1), folder)

@@ -28,12 +28,12 @@ LEARNED = [n for n in OURS if build_model(load_preset(n, "smoke", TASK), TASK).i
 # Steps of the whole batch, learning rate, and settings where the preset "smoke" has others. The gradient is clipped
 # for models that learn single steps: those right after the change of material are twenty times as large as others.
 CLIPPED = {"training.gradient_clip": 0.1}
-ALL_PAIRS = {"model.training_context_pairs": CONTEXT - 1}  # prediction reads all
+ALL_PAIRS = {"model.max_training_context_pairs": None}  # prediction reads all
 # Small errors of a step grow with the horizon: a rollout needs a network that can undo them, and noise that asks it to.
 ROLLOUT = CLIPPED | {"model.width": 64, "model.message_passing_steps": 4, "model.noise": 1e-3}
 WITH_CONTEXT = 350, 5e-3, ALL_PAIRS
 STEP_WISE = 1200, 5e-3, ALL_PAIRS | CLIPPED | {"model.noise": 1e-4}
-SETTINGS: dict[str, tuple[int, float, dict[str, float]]] = {
+SETTINGS: dict[str, tuple[int, float, dict[str, float | None]]] = {
     "mgn_mp": (400, 5e-3, {"model.initial_tau": 0.5}),
     "mgn": (3000, 3e-3, ROLLOUT),
     "mgn_material": (1500, 3e-3, ROLLOUT),
