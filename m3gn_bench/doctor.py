@@ -13,12 +13,11 @@ from typing import Literal
 import numpy as np
 
 from m3gn_bench.datasets.errors import BenchError
-from m3gn_bench.datasets.plugins import Kind, package_of, plugins
+from m3gn_bench.datasets.plugins import DISTRIBUTION, Kind, package_of, plugins
 from m3gn_bench.datasets.recorded import TOLERANCE, probe, read_record
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.version import __version__
 
-DISTRIBUTION = "m3gn-bench"
 PAPER_TIERS_GB = 2.5  # of all scenes together
 State = Literal["fine", "missing", "wrong"]
 
