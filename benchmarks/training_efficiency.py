@@ -67,6 +67,8 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "one context pair": ({"model.max_training_context_pairs": 1}, None),
     "four trajectories per step": ({"training.batch_size": 4}, None),
     "four and all pairs": ({"training.batch_size": 4, "model.max_training_context_pairs": None}, None),
+    "eight trajectories per step": ({"training.batch_size": 8}, None),
+    "eight and all pairs": ({"training.batch_size": 8, "model.max_training_context_pairs": None}, None),
     "four and one pair": ({"training.batch_size": 4, "model.max_training_context_pairs": 1}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
     "constant learning rate": ({"training.cosine_decay": False}, None),

@@ -192,10 +192,14 @@ def run_with_slurm(
     part = _Part(_OnWorker(function, shared.absolute()))
     count = min(len(todo), PARTS_PER_WORKER * workers, LARGEST_ARRAY)
     parts = [todo[start::count] for start in range(count)]
-    try:
-        submitted = executor.map_array(part, parts)
-    except (FailedJobError, FailedSubmissionError) as error:
-        raise GeneratorError(f"SLURM does not take the jobs: {error}") from error
+
+    def accepted(submit: Callable[[], Any]) -> Any:
+        try:
+            return submit()
+        except (FailedJobError, FailedSubmissionError) as error:
+            raise GeneratorError(f"SLURM does not take the jobs: {error}") from error
+
+    submitted = accepted(lambda: executor.map_array(part, parts))
     pending = [(job, jobs_of, 0) for job, jobs_of in zip(submitted, parts, strict=True)]
     try:
         while pending:
@@ -215,7 +219,8 @@ def run_with_slurm(
                             f"SLURM job {job.job_id} was lost (out of memory?), as it was {lost} times before; its log "
                             f"is {job.paths.stdout}; run the same command again to go on"
                         ) from error
-                    pending.append((executor.submit(part, jobs_of), jobs_of, lost + 1))
+                    again = accepted(partial(executor.submit, part, jobs_of))
+                    pending.append((again, jobs_of, lost + 1))
                     continue
                 if isinstance(made, BenchError):
                     raise made

@@ -164,6 +164,19 @@ def _planned(plan: Plan, grid: Grid, task_name: str, model: str, seed: int) -> P
     )
 
 
+def require_own_folders(planned: Sequence[PlannedRun], records: Sequence[ResultRecord]) -> None:
+    """Raises ConfigError if a checkpoint would replace one of another track: folders do not tell tracks apart."""
+    for run in planned:
+        named = run.task, run.config.model_name, run.config.preset, run.seed
+        for record in records if run.ships else ():
+            taken = record.task, record.model, record.preset, record.seed
+            if record.ships and record.track != run.track and taken == named:
+                raise ConfigError(
+                    f"{run.task}/{run.name}: its checkpoint would replace that of track {record.track!r}; leave its "
+                    "seed out of shipped_seeds"
+                )
+
+
 @dataclass(frozen=True)
 class Job:
     """What a process needs to carry out a run.

@@ -1,12 +1,16 @@
 """The leaderboard as Markdown, generated from the records and from nothing else."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from m3gn_bench.leaderboard.figures import STYLES
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_below, titles
 
 FIGURES = "figures"  # the folder beside the page
+PICTURES = {
+    "overlay": "Predicted last frames, coloured by their distance from the truth, whose edges are drawn",
+    "latent": "M3GN's descriptions of all test trajectories, coloured by material (t-SNE)",
+}
 
 HEADER = """# Leaderboard
 
@@ -38,17 +42,27 @@ def tracks_of(records: Sequence[ResultRecord]) -> list[str]:
     return [name for name in TRACKS if name in found] + sorted(found - set(TRACKS))
 
 
-def render(records: Sequence[ResultRecord]) -> str:
-    """The whole page."""
+def render(records: Sequence[ResultRecord], pictures: Collection[str] = ()) -> str:
+    """The whole page.
+
+    Args:
+        records: all of them.
+        pictures: names of files in the folder of figures that `m3gn-bench leaderboard pictures` drew; shown if there.
+    """
     parts = [HEADER]
     for track in tracks_of(records):
         parts.append(f"## Track: {track}\n\n{TRACKS.get(track, '')}\n")
-        for name, title in titles(records).items():
+        for name, task_title in titles(records).items():
             rows = entries(records, track, name)
             if rows:
-                parts.append(_task_table(title, rows))
+                parts.append(_task_table(task_title, rows))
                 if track == "compact" and any(row.label in STYLES for row in rows):
                     parts.append(f"![Errors over context frames and over time]({FIGURES}/{name}.svg)\n")
+                    parts += [
+                        f"![{title}]({FIGURES}/{kind}-{name}.png)\n"
+                        for kind, title in PICTURES.items()
+                        if f"{kind}-{name}.png" in pictures
+                    ]
         if track == "compact":
             parts.append(_runtimes(records, track))
     return "\n".join(parts)

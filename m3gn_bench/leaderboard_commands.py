@@ -89,8 +89,10 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
     if not check:
         require_drawable(folder / "figure.svg")
     current = {}
-    for name, make in (("LEADERBOARD.md", render_page), ("CLAIMS.md", render_claims)):
-        path, content = folder / name, make(records).encode()
+    shown = {path.name for path in (folder / FIGURES).glob("*.png")}
+    pages = {"LEADERBOARD.md": render_page(records, shown), "CLAIMS.md": render_claims(records)}
+    for name, text in pages.items():
+        path, content = folder / name, text.encode()
         current[str(path)] = path.is_file() and path.read_bytes() == content
         if not check:
             write_bytes_atomically(path, content)
@@ -133,6 +135,7 @@ def pictures(task_name: str | None, output: Path, tier: str, workers: int, data:
     from m3gn_bench.figures import require_drawable, save
     from m3gn_bench.leaderboard.pictures import draw_latents, draw_overlays
     from m3gn_bench.leaderboard.record import HOME, checkpoint_folder, read_records
+    from m3gn_bench.leaderboard.render import PICTURES
     from m3gn_bench.leaderboard.summary import middle
     from m3gn_bench.m3gn import M3GN
     from m3gn_bench.sources import find_or_generate
@@ -157,7 +160,7 @@ def pictures(task_name: str | None, output: Path, tier: str, workers: int, data:
         assert isinstance(model, M3GN)
         cases = load_cases(path, task, "test", tier)
         save(draw_latents(model, cases, middle(task.context_sizes)), output / f"latent-{name}.png")
-        written += [str(output / f"{kind}-{name}.png") for kind in ("overlay", "latent")]
+        written += [str(output / f"{kind}-{name}.png") for kind in PICTURES]
     report.finish({"files": written}, *written, f"{len(written)} pictures")
 
 
@@ -318,7 +321,7 @@ def campaign(
     from m3gn_bench.generators.executors import parse_executor
     from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.generators.workers import run_jobs
-    from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan
+    from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan, require_own_folders
     from m3gn_bench.leaderboard.record import read_records
     from m3gn_bench.sources import find_or_generate
     from m3gn_bench.tasks import get_task
@@ -328,6 +331,7 @@ def campaign(
     planned = read_plan(plan)
     versions = {run.task: get_scene(get_task(run.task).scene).dataset_version for run in planned}
     records = read_records(home)
+    require_own_folders(planned, records)
     states = [run.state(records, versions[run.task]) for run in planned]
     todo = [run for run, state in zip(planned, states, strict=True) if state != "done"]
     problems: dict[str, str] = {}

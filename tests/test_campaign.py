@@ -122,6 +122,18 @@ def test_shipping_later_is_something_to_do(
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "runs").rglob("weights.safetensors")} == trained
 
 
+def test_tracks_do_not_replace_each_others_checkpoints(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = GRID + "shipped_seeds = [0]\n"
+    carry(campaign(write(tmp_path, grid), smoke_file.parent), capsys)
+    other = write(tmp_path, grid, head=HEAD.replace("trial", "other"))
+    with pytest.raises(SystemExit) as stop:
+        run(campaign(other, smoke_file.parent))
+    assert stop.value.code == 2
+    assert "that of track 'trial'" in capsys.readouterr().err
+
+
 def test_a_killed_campaign_goes_on(
     smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -199,7 +199,15 @@ def test_pages_are_written_and_checked(tmp_path: Path, capsys: pytest.CaptureFix
         assert (stop.value.code or 0) == code
         assert json.loads(capsys.readouterr().out)["up_to_date"]
     assert (tmp_path / "figures" / "sheet_deformation.svg").is_file()
-    write_record(made_up("mgn", 2.0), tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        run(["leaderboard", "render", "--home", str(tmp_path), "--check"])
-    assert stop.value.code == 1
+    assert "overlay" not in (tmp_path / "LEADERBOARD.md").read_text()
+    for late in (
+        lambda: write_record(made_up("mgn", 2.0), tmp_path),
+        lambda: (tmp_path / "figures" / "overlay-sheet_deformation.png").touch(),
+    ):
+        late()
+        with pytest.raises(SystemExit) as stop:
+            run(["leaderboard", "render", "--home", str(tmp_path), "--check"])
+        assert stop.value.code == 1
+        with pytest.raises(SystemExit):
+            run(["leaderboard", "render", "--home", str(tmp_path)])
+    assert "(figures/overlay-sheet_deformation.png)" in (tmp_path / "LEADERBOARD.md").read_text()
