@@ -46,8 +46,6 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         problems.append(
             f"errors over time are of {sorted(frames)} frames, not of {TASKS[record.task].frames}"
         )
-    if record.ships:
-        problems.append("ships is true, but only the project's own checkpoints ship")
     if find_record(board, record.track, record.task, record.name) is not None and not replace:
         problems.append(
             f"there is a record of {record.task}/{record.name} already; give --replace to replace it"

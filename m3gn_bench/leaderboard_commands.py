@@ -277,7 +277,8 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
     from m3gn_bench.leaderboard.record import read_record, read_records, write_record
     from m3gn_bench.leaderboard.submission import review
 
-    submitted = read_record(record)
+    # Its author may have kept the checkpoint beside the record; this board does not.
+    submitted = read_record(record).model_copy(update={"ships": False})
     verdict = review(submitted, read_records(home), replace)
     path = None if verdict.problems else write_record(submitted, home)
     Report(as_json).finish(

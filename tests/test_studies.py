@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from m3gn_bench import stability, tradeoff
+from m3gn_bench import stability, study_commands, tradeoff
 from m3gn_bench.cli import cli
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.figures import save
 from m3gn_bench.generators.deformable_block import DeformableBlock
 from m3gn_bench.generators.extremes import Extreme, Extremes, extremes_of
 from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
-from m3gn_bench.generators.scene import scene_names
+from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.leaderboard.record import checkpoint_folder
@@ -272,6 +272,7 @@ def assert_sound(result: tradeoff.TradeOff) -> None:
 @pytest.mark.usefixtures("small")
 def test_a_wrong_cell_is_an_exit_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(DeformableBlock, "check", lambda self, trajectory: ["it failed"])
+    monkeypatch.setattr(study_commands, "_checkpoints", lambda task, folders: [])
     done = CliRunner().invoke(
         cli, ["stability", "deformable_block", "--workers", "1", "--data", str(tmp_path)]
     )
@@ -309,18 +310,15 @@ RECORDS = Path(__file__).parents[1] / "docs" / "studies"
 
 
 def test_recorded_tradeoffs() -> None:
-    """Every task has one, with the default fidelity on the front where steps and mesh count each for itself.
-
-    References are converged but for falling bodies, where the third mesh still differs from the second by two thirds
-    as much as that from the first: thin limbs of linear tetrahedra hit the floor. The page says so.
-    """
+    """Every task has one, with the default fidelity on the front, against a reference that is converged."""
     found, _ = read_records(RECORDS)
     assert [study.task for study in found] == list(TASKS)
     for study in found:
         assert not study.default.refused
         assert study.default.error
-        assert study.default.on_front_by_parts, study.task
-        assert is_converged(study) != study.scene.startswith(("falling", "mixed")), study.task
+        assert study.default.on_front, study.task
+        assert is_converged(study), study.task
+        assert study.dataset_version == get_scene(study.scene).dataset_version, study.task
 
 
 def test_recorded_stability() -> None:
