@@ -83,7 +83,7 @@ def draw_overlays(
         else:
             axes = figure.add_subplot(rows, columns, place)
             axes.add_collection(PolyCollection(list(predicted[triangles]), facecolors=faces))
-            axes.add_collection(LineCollection(truth[edges], colors="0.2", linewidths=0.4))
+            axes.add_collection(LineCollection(list(truth[edges]), colors="0.2", linewidths=0.4))
             axes.autoscale()
         axes.set(title=name, aspect="equal")
         axes.set_axis_off()
