@@ -320,17 +320,16 @@ def campaign(
     """
     from m3gn_bench.datasets.writer import reserved
     from m3gn_bench.generators.executors import parse_executor
-    from m3gn_bench.generators.scene import get_scene
     from m3gn_bench.generators.workers import run_jobs
     from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan, require_own_folders
     from m3gn_bench.leaderboard.record import read_records
-    from m3gn_bench.sources import find_or_generate
+    from m3gn_bench.sources import dataset_version, find_or_generate
     from m3gn_bench.tasks import get_task
 
     report = Report(as_json)
     parse_executor(executor)
     planned = read_plan(plan)
-    versions = {run.task: get_scene(get_task(run.task).scene).dataset_version for run in planned}
+    versions = {run.task: dataset_version(get_task(run.task)) for run in planned}
     records = read_records(home)
     require_own_folders(planned, records)
     states = [run.state(records, versions[run.task]) for run in planned]
