@@ -9,8 +9,9 @@ from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.campaign import Outcome
+from m3gn_bench.leaderboard.consistency import contradictions
 from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder, find_record
-from m3gn_bench.sources import dataset_version, number_of_trajectories, regenerate
+from m3gn_bench.sources import regenerate
 from m3gn_bench.tasks import get_task
 
 Kind = Literal["shipped checkpoint", "trained again"]
@@ -76,7 +77,7 @@ def check_records(
         if description != record.checkpoint:
             problems.append(f"{where}: the shipped checkpoint is not the one that was recorded")
             continue
-        problems += [f"{where}: {problem}" for problem in _contradictions(record, model.parameter_count())]
+        problems += [f"{where}: {problem}" for problem in contradictions(record)]
         count = min(trajectories, len(record.keys))
         chosen = sorted({(offset * count + i) % len(record.keys) for i in range(count)})
         cases, hashes = regenerate(get_task(record.task), [record.keys[i] for i in chosen])
@@ -96,25 +97,6 @@ def check_records(
             ]
         on_progress(done, len(records))
     return CheckReport.of(compared, problems)
-
-
-def _contradictions(record: ResultRecord, parameters: int) -> list[str]:
-    """What a record says of itself that is not so."""
-    task = get_task(record.task)
-    described = record.checkpoint
-    expected = {
-        "task, model, preset, seed": (
-            (record.task, record.model, record.preset, record.seed),
-            (described.task, described.config.model_name, described.config.preset, described.seed),
-        ),
-        "parameters": (record.parameters, parameters),
-        "dataset_version": (record.dataset_version, dataset_version(task)),
-        "context sizes": (tuple(result.context for result in record.results), task.context_sizes),
-    }
-    if not record.materials:
-        number = number_of_trajectories(task, record.tier, record.split)  # type: ignore[arg-type]
-        expected["number of trajectories"] = (len(record.keys), number)
-    return [f"{name}: {stated}, not {true}" for name, (stated, true) in expected.items() if stated != true]
 
 
 def compare_with_retrained(records: Sequence[ResultRecord], again: Sequence[Outcome]) -> CheckReport:

@@ -2,14 +2,10 @@
 
 from collections.abc import Sequence
 
-from pydantic import ValidationError
-
-from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.schema import IMPORTED, Record
-from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.consistency import contradictions
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
-from m3gn_bench.model import RunConfig, build_model, model_names
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.model import model_names
 
 
 class Verdict(Record):
@@ -32,31 +28,17 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         problems.append(
             f"record_schema is {record.record_schema}, not {RECORD_SCHEMA}: make it with this version"
         )
-    if record.task not in TASKS:
-        return Verdict(problems=(unknown_name("task", record.task, list(TASKS)),), remarks=())
     if record.dataset_version.startswith(IMPORTED):
         problems.append("it was scored on imported data, but boards are of the benchmark's own")
+        return Verdict(problems=tuple(problems), remarks=())
     if record.split != "test" and record.track != "tuning":
         problems.append(f"split is {record.split!r}, but boards are of the test split")
-    contexts = tuple(result.context for result in record.results)
-    if contexts != TASKS[record.task].context_sizes:
-        problems.append(f"context sizes are {contexts}, not the task's {TASKS[record.task].context_sizes}")
-    frames = {result.context + len(result.per_timestep_mse) for result in record.results}
-    if frames != {TASKS[record.task].frames}:
-        problems.append(
-            f"errors over time are of {sorted(frames)} frames, not of {TASKS[record.task].frames}"
-        )
     if find_record(board, record.track, record.task, record.name) is not None and not replace:
         problems.append(
             f"there is a record of {record.task}/{record.name} already; give --replace to replace it"
         )
-    described = record.checkpoint
-    stated = (described.task, described.config.model_name, described.config.preset, described.seed)
-    if stated != (record.task, record.model, record.preset, record.seed):
-        problems.append(f"the checkpoint's description is of another run: {'/'.join(map(str, stated))}")
-    if record.model in model_names():
-        problems += _configuration_problems(record)
-    else:
+    problems += contradictions(record)
+    if record.model not in model_names():
         remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
 
     problems += _unequal_conditions(record, board)
@@ -70,8 +52,6 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         remarks.append("nothing on the board was scored on such trajectories: the data were not compared")
         return Verdict(problems=tuple(problems), remarks=tuple(remarks))
     peer = peers[0]
-    if record.dataset_version != peer.dataset_version:
-        problems.append(f"dataset version is {record.dataset_version}, not {peer.dataset_version}")
     if record.keys != peer.keys:
         problems.append(f"it has other trajectories than {peer.task}/{peer.name}, or another order of them")
     else:
@@ -83,22 +63,6 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
                 "kind of processor they may ('m3gn-bench reproduce' tells whether by more than rounding)"
             )
     return Verdict(problems=tuple(problems), remarks=tuple(remarks))
-
-
-def _configuration_problems(record: ResultRecord) -> list[str]:
-    """What is wrong with the settings of a model that is installed here."""
-    described = record.checkpoint
-    try:
-        config = RunConfig.from_json(described.config.model_dump())
-    except (ConfigError, ValidationError) as error:
-        return [f"the configuration is none of {record.model}: {error}"]
-    problems = []
-    if config.hash() != described.config_hash:
-        problems.append("config_hash is not that of the configuration")
-    count = build_model(config, TASKS[record.task]).parameter_count()
-    if count != record.parameters:
-        problems.append(f"the model has {count} parameters with these settings, not {record.parameters}")
-    return problems
 
 
 def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:

@@ -52,12 +52,16 @@ class Study:
         folder: where results are kept.
         settings: what results depend on; those of other settings, or of another version, are dropped.
 
+    Attributes:
+        results: those there are of the cells that were asked for, by their names.
+
     Raises:
         ConfigError: the folder cannot be written.
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
         self.folder = folder
+        self.results: dict[str, Result] = {}
         head = json.dumps({"settings": settings, "version": __version__}, sort_keys=True).encode()
         written = folder / "settings.json"
         try:
@@ -80,7 +84,7 @@ class Study:
         """
         paths = {cell.name: self.folder / f"{number:03}.npz" for number, cell in enumerate(cells)}
         kept = {name: _read(path) for name, path in paths.items()}
-        results = {
+        results = self.results = {
             name: found for name, found in kept.items() if found is not None and found.values["key"] == name
         }
 

@@ -213,7 +213,7 @@ def measure(
     use_cpu(1)
     with threadpool_limits(1):
         run = partial(run_jobs, workers=workers)
-        results = study.measure(bench.cells([one for one, _ in shipped]), on_progress, run)
+        results = study.measure(bench.cells([one for one, _ in shipped], study), on_progress, run)
     simulators = bench.simulators(results)
     default = default_of(simulators)
     if default.refused or default.seconds is None:
@@ -305,19 +305,18 @@ class Bench:
         self.machine = machine()
         self.parameters = {i: draw(scene, "test", i, DATASET_SEED) for i in knobs.draws}
         self._simulated: dict[int, Any] = {}
-        self._seconds: dict[tuple[str, int], float] = {}
 
     # -- measuring -------------------------------------------------------------------------------------
 
-    def cells(self, shipped: Sequence[Shipped]) -> list[Cell]:
-        """Cheap ones first, so that a mistake shows early."""
+    def cells(self, shipped: Sequence[Shipped], study: Study) -> list[Cell]:
+        """All that the study measures. Cheap ones first, so that a mistake shows early."""
         turns = [(setting, i) for i in self.knobs.draws for setting in self.knobs.settings]
         cells = [
             Cell(f"{setting.name} {i}", lambda s=setting, i=i: self._timed(s, i))  # type: ignore[misc]
             for setting, i in turns
         ]
         cells += [
-            Cell(_again_name(setting, i, number), lambda s=setting, i=i: self._timed_again(s, i))  # type: ignore[misc]
+            Cell(_again_name(setting, i, number), lambda s=setting, i=i: self._timed_again(s, i, study))  # type: ignore[misc]
             for number in range(1, ROUNDS)
             for setting, i in turns
         ]
@@ -363,7 +362,6 @@ class Bench:
                 seconds = start + each * (scene.frames - short)
         except (SolverError, GeneratorError) as error:  # not solved; or a library is not installed
             return Result({"refused": str(error), "seconds": None})
-        self._seconds[setting.name, index] = seconds
         # A body that is seen in mid-impact only is not judged by how it ends.
         problems = scene.check(trajectory) if full else []
         return Result(
@@ -371,12 +369,12 @@ class Bench:
             {"positions": self._window(trajectory.positions), "rest": trajectory.mesh.rest_positions},
         )
 
-    def _timed_again(self, setting: "Setting", index: int) -> Result:
+    def _timed_again(self, setting: "Setting", index: int, study: Study) -> Result:
         """CPU seconds of the same trajectory once more; None where once is enough, or it is refused."""
         from m3gn_bench.generators.scene import get_scene
 
-        before = self._seconds.get((setting.name, index), math.inf)
-        if before > LONG or not self.knobs.full_length(setting):
+        before = study.results[f"{setting.name} {index}"].values["seconds"]
+        if before is None or before > LONG or not self.knobs.full_length(setting):
             return Result({"seconds": None})
         scene = get_scene(self.task.scene, **setting.options)
         return Result({"seconds": self._run(scene, setting.level, index, None)[0]})

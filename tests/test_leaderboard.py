@@ -152,9 +152,9 @@ def fewer(values: dict[str, Any], count: int) -> dict[str, Any]:
     ("plant", "reason"),
     [
         (lambda values: fewer(values, 2), "number of trajectories: 2, not 4"),
-        (lambda values: values | {"dataset_version": "9.9"}, "dataset_version: 9.9"),
+        (lambda values: values | {"dataset_version": "9.9"}, "dataset version: 9.9"),
         (lambda values: values | {"parameters": 7}, "parameters: 7"),
-        (lambda values: values | {"seed": 3}, "task, model, preset, seed"),
+        (lambda values: values | {"seed": 3}, "checkpoint's task, model, preset and seed"),
         (lambda values: values | {"results": values["results"][1:]}, "context sizes"),
     ],
 )
@@ -372,18 +372,18 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
     [
         ({"task": "sheet"}, "unknown task 'sheet'"),
         ({"split": "validation"}, "boards are of the test split"),
-        ({"dataset_version": "0.9"}, "dataset version is 0.9"),
-        ({"parameters": 7}, "parameters with these settings, not 7"),
-        ({"seed": 3}, "description is of another run"),
+        ({"dataset_version": "0.9"}, "dataset version: 0.9"),
+        ({"parameters": 7}, "parameters: 7, not"),
+        ({"seed": 3}, "checkpoint's task, model, preset and seed"),
         ({"keys": ("test_00003", "test_00002", "test_00001", "test_00000")}, "other trajectories"),
         ({"track": "test"}, "already"),
         ({"record_schema": 1}, "record_schema"),
         ({"track": "test", "seed": 1, "tier": "quick"}, "tier is quick, but smoke"),
         (training(steps=600), "steps is 600, but 3"),
         (checkpoint(device="cuda"), "device is cuda, but cpu"),
-        (checkpoint(config_hash="0"), "config_hash is not that"),
-        (training(optimizer="sgd"), "the configuration is none of mgn"),
-        (per_timestep(-1), "errors over time are of"),
+        (checkpoint(config_hash="0"), "config_hash: 0, not"),
+        (training(optimizer="sgd"), "configuration: none of mgn"),
+        (per_timestep(-1), "frames that errors are of"),
     ],
 )
 def test_what_is_wrong_with_a_submission_is_named(

@@ -210,6 +210,24 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("m3gn_bench.generators.extremes.extremes_of", lambda scene: grid)
 
 
+def test_an_interrupted_tradeoff_still_times_in_rounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether a setting is timed again depends on a time that may be from before the interruption."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tradeoff.Bench, "_timed_again", stop)
+        with pytest.raises(KeyboardInterrupt):
+            tradeoff.measure(TASK, [], tmp_path, knobs=SMALL)
+    _, study = tradeoff.measure(TASK, [], tmp_path, knobs=SMALL)
+    rounds = [name for name in study.results if name.startswith(SMALL.settings[0].name)]
+    assert len(rounds) == tradeoff.ROUNDS * len(SMALL.draws)
+    assert all(study.results[name].values["seconds"] for name in rounds)
+
+
 @pytest.mark.usefixtures("small")
 def test_commands_measure_record_and_render(tmp_path: Path) -> None:
     """Both studies and the page; then the page is up to date, until a record changes."""

@@ -1,0 +1,54 @@
+"""What a record says of its task, its model and its run that is not so in this version of the project."""
+
+from pydantic import ValidationError
+
+from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.schema import TIERS, as_split
+from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.record import ResultRecord
+from m3gn_bench.model import RunConfig, build_model, model_names
+from m3gn_bench.sources import dataset_version, number_of_trajectories
+from m3gn_bench.tasks import TASKS
+
+
+def contradictions(record: ResultRecord) -> list[str]:
+    """One sentence each; none where all is well.
+
+    A record's statistics need no look: they are derived from its errors whenever it is read. Parameters of a model
+    that is not installed cannot be counted, nor is it known how many trajectories are of some materials only.
+    """
+    if record.task not in TASKS:
+        return [unknown_name("task", record.task, list(TASKS))]
+    if record.tier not in TIERS:
+        return [unknown_name("tier", record.tier, list(TIERS))]
+    task, described = TASKS[record.task], record.checkpoint
+    frames = {result.context + len(result.per_timestep_mse) for result in record.results}
+    expected: dict[str, tuple[object, object]] = {
+        "checkpoint's task, model, preset and seed": (
+            (described.task, described.config.model_name, described.config.preset, described.seed),
+            (record.task, record.model, record.preset, record.seed),
+        ),
+        "dataset version": (record.dataset_version, dataset_version(task)),
+        "context sizes": (tuple(result.context for result in record.results), task.context_sizes),
+        "frames that errors are of": (sorted(frames), [task.frames]),
+    }
+    if not record.materials:
+        number = number_of_trajectories(task, record.tier, as_split(record.split))
+        expected["number of trajectories"] = (len(record.keys), number)
+    found = [f"{name}: {stated}, not {true}" for name, (stated, true) in expected.items() if stated != true]
+    return found + (_of_the_configuration(record) if record.model in model_names() else [])
+
+
+def _of_the_configuration(record: ResultRecord) -> list[str]:
+    described = record.checkpoint
+    try:
+        config = RunConfig.from_json(described.config.model_dump())
+        parameters = build_model(config, TASKS[record.task]).parameter_count()
+    except (ConfigError, ValidationError) as error:
+        return [f"configuration: none of {record.model}: {error}"]
+    found = []
+    if config.hash() != described.config_hash:
+        found.append(f"config_hash: {described.config_hash}, not {config.hash()}")
+    if parameters != record.parameters:
+        found.append(f"parameters: {record.parameters}, not {parameters}")
+    return found
