@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scipy.stats import gmean
 
 from m3gn_bench.baselines.mgn import MeshGraphNet
 from m3gn_bench.checkpoint import load_checkpoint
@@ -18,6 +19,8 @@ from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.campaign import PLANS, Job, Outcome, carry_out, read_plan
 from m3gn_bench.leaderboard.check import compare_with_retrained
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
+from m3gn_bench.model import load_preset
+from m3gn_bench.tasks import TASKS
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
 HEAD = 'track = "trial"\ntier = "smoke"\n'
@@ -219,6 +222,22 @@ def test_shipped_plans_can_be_read() -> None:
     assert set(trials) == {
         run.config.model_name for run in plans["compact"] if run.config.training.minutes is not None
     }
+
+
+def test_presets_have_the_rates_of_the_trials() -> None:
+    """The best of each method's own; a rate that nobody tried is nobody's."""
+    trials = [record for record in read_records() if record.track == "tuning"]
+    for model in {record.model for record in trials}:
+        own = [record for record in trials if record.model == model]
+        for task in TASKS.values():
+            of_scene = [record for record in own if TASKS[record.task].scene == task.scene]
+            errors: dict[float, list[float]] = {}
+            for record in of_scene or own:
+                rate = record.checkpoint.config.training["learning_rate"]
+                errors.setdefault(rate, []).extend(result.mse for result in record.results)
+            assert len(errors) == 3
+            best = min(errors, key=lambda rate: gmean(errors[rate]))
+            assert load_preset(model, "compact", task).training.learning_rate == best, (model, task.name)
 
 
 def test_planted_error_in_training_is_found(
