@@ -85,7 +85,11 @@ def advice(study: TradeOff) -> list[str]:
     sentences: list[str] = []
     ways, before = _ways(study), None
     for budget in BUDGETS:
-        able = [(w.seconds, n) for n, w in enumerate(ways) if _shown(w) and (w.error or 0) <= budget]
+        able = [
+            (w.seconds, n)
+            for n, w in enumerate(ways)
+            if _shown(w) and w.on_front and (w.error or 0) <= budget
+        ]
         best = min(able, default=None)
         if best is None or budget < (study.convergence.remaining or 0):
             sentences.append(f"within {_percent(budget)} nothing here can be shown to be")

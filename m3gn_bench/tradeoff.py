@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from m3gn_bench.generators.scene import Scene
 
 REPETITIONS = 5  # of a model's prediction
-# Of a simulation, in turns with all others: a slow minute of the machine spoils one round at most.
-ROUNDS = 3
+# Simulations are timed in rounds, in turns with all others: a slow minute of the machine spoils one round at most.
+ROUNDS = 6
 ENOUGH = 0.5  # seconds of simulations in a round, after which none is repeated
-LONG = 3.0  # seconds of a simulation, from which on one round does
+LONG = 3.0  # seconds in rounds before, after which a setting takes part in no other
 # Times of the same work differ by this much from run to run, and errors of the same size from draw to draw: closer
 # ones count as equal.
 TIME_MARGIN, ERROR_MARGIN = 1.1, 1.01
@@ -311,17 +311,14 @@ class Bench:
     def cells(self, shipped: Sequence[Shipped], study: Study) -> list[Cell]:
         """All that the study measures. Cheap ones first, so that a mistake shows early."""
         turns = [(setting, i) for i in self.knobs.draws for setting in self.knobs.settings]
-        cells = [
-            Cell(f"{setting.name} {i}", lambda s=setting, i=i: self._timed(s, i))  # type: ignore[misc]
-            for setting, i in turns
-        ]
+        cells = [Cell(f"{setting.name} {i}", partial(self._timed, setting, i)) for setting, i in turns]
         cells += [
-            Cell(_again_name(setting, i, number), lambda s=setting, i=i: self._timed_again(s, i, study))  # type: ignore[misc]
+            Cell(_again_name(setting, i, number), partial(self._timed_again, setting, i, number, study))
             for number in range(1, ROUNDS)
             for setting, i in turns
         ]
         cells += [
-            Cell(f"{_model_name(one)} {context} {i}", lambda o=one, c=context, i=i: self._predict(o, c, i))  # type: ignore[misc]
+            Cell(f"{_model_name(one)} {context} {i}", partial(self._predict, one, context, i))
             for one in shipped
             for context in self.task.context_sizes
             for i in self.knobs.draws
@@ -369,12 +366,13 @@ class Bench:
             {"positions": self._window(trajectory.positions), "rest": trajectory.mesh.rest_positions},
         )
 
-    def _timed_again(self, setting: "Setting", index: int, study: Study) -> Result:
-        """CPU seconds of the same trajectory once more; None where once is enough, or it is refused."""
+    def _timed_again(self, setting: "Setting", index: int, number: int, study: Study) -> Result:
+        """CPU seconds of the same trajectory in a later round; None where earlier ones are enough, or it is refused."""
         from m3gn_bench.generators.scene import get_scene
 
         before = study.results[f"{setting.name} {index}"].values["seconds"]
-        if before is None or before > LONG or not self.knobs.full_length(setting):
+        enough = before is None or number * max(before, ENOUGH) >= LONG
+        if enough or not self.knobs.full_length(setting):
             return Result({"seconds": None})
         scene = get_scene(self.task.scene, **setting.options)
         return Result({"seconds": self._run(scene, setting.level, index, None)[0]})
