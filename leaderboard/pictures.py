@@ -71,7 +71,7 @@ def draw_overlays(
     columns = min(len(predictions), 3)
     rows = -(-len(predictions) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.4 * rows), layout="constrained")
-    figure.suptitle(f"{task.title}, {key}, last frame after {context} context frames")
+    figure.suptitle(f"{task.title}, {key}\nlast frame after {context} context frames")
     panels: list[Any] = []
     for place, (name, predicted) in enumerate(predictions.items(), 1):
         faces = colours.to_rgba(distances[name][triangles].mean(1))
@@ -115,7 +115,7 @@ def draw_latents(model: M3GN, cases: Sequence[Case], context: int) -> "Figure":
     materials = torch.cat([case.body.material for case in cases]).numpy()
     names = [feature.name for feature in model.task.material]
     figure = Figure(figsize=(4.5 * len(names), 4), layout="constrained")
-    figure.suptitle(f"{model.task.title}: task descriptions after {context} frames")
+    figure.suptitle(f"{model.task.title}\ntask descriptions after {context} frames")
     for number, name in enumerate(names):
         axes = figure.add_subplot(1, len(names), number + 1)
         shown = axes.scatter(places[:, 0], places[:, 1], c=materials[:, number], cmap="viridis", s=14)
