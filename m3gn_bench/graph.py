@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -47,6 +48,29 @@ class Graph:
     def endpoint_rows(self) -> Tensor:
         """Rows of a table [2 nodes, n] with a node's part as sender and as receiver in turn, shape [edges, 2]."""
         return torch.stack([2 * self.senders, 2 * self.receivers + 1], dim=1)
+
+    @cached_property
+    def edges_by_receiver(self) -> tuple[Tensor, Tensor]:
+        """Edges in the order of their receivers, shape [edges], and where each node's begin, shape [nodes]."""
+        return _by_group(self.receivers, len(self.node_features))
+
+    @cached_property
+    def edges_by_endpoint_row(self) -> tuple[Tensor, Tensor]:
+        """Edges in the order of `endpoint_rows`, shape [2 edges], and where each row's begin, shape [2 nodes]."""
+        ends, starts = _by_group(self.endpoint_rows.flatten(), 2 * len(self.node_features))
+        return ends // 2, starts
+
+
+def _by_group(groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Members in the order of their groups, and where each of `count` groups begins."""
+    members = np.arange(len(groups))
+    # Counts instead of sorting, which takes five times as long.
+    table = coo_array(
+        (np.ones(len(groups), dtype=bool), (groups.cpu().numpy(), members)), shape=(count, len(groups))
+    )
+    rows = table.tocsr()
+    order, starts = (torch.from_numpy(part.astype(np.int64)) for part in (rows.indices, rows.indptr[:-1]))
+    return order.to(groups.device), starts.to(groups.device)
 
 
 def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, features: Tensor) -> Graph:

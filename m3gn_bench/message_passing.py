@@ -15,29 +15,115 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from m3gn_bench.graph import Graph
 
+LEAKY_RELU_SLOPE = 0.01
 
-class _SumOfEndpoints(torch.autograd.Function):
-    """table[2 sender] + table[2 receiver + 1] for every edge, in one pass over memory.
 
-    The backward pass of `embedding_bag` itself sorts the edges anew each time.
+class _Exchange(torch.autograd.Function):
+    """The block, given what of W_e's product is known on nodes, with a backward pass of its own.
+
+    The product on edges is A x, where x is `edges` if `inputs` is None; `endpoints` [nodes, 2 width] has the rest for
+    each node as a sender and as a receiver. The backward pass accumulates in place what autograd would add up from
+    tensors of their own (docs/performance.md says what that saves). It overwrites what was saved for it, so torch
+    refuses to go through it a second time.
     """
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, graph: Graph) -> Tensor:
-        ctx.rows, ctx.graph = len(table), graph
-        return functional.embedding_bag(graph.endpoint_rows, table, mode="sum")
+    def forward(
+        ctx: Any,
+        nodes: Tensor,
+        edges: Tensor,
+        inputs: Tensor | None,
+        weight: Tensor,
+        endpoints: Tensor,
+        edge_norm_weight: Tensor,
+        edge_norm_bias: Tensor,
+        node_weight: Tensor,
+        node_bias: Tensor,
+        message_weight: Tensor,
+        node_norm_weight: Tensor,
+        node_norm_bias: Tensor,
+        graph: Graph,
+    ) -> tuple[Tensor, Tensor]:
+        ctx.graph, ctx.recurrent = graph, inputs is None
+        ctx.set_materialize_grads(False)
+        dtype = endpoints.dtype  # of products, also under autocast
+        inputs = (edges if inputs is None else inputs).to(dtype)
+        update = functional.embedding_bag(graph.endpoint_rows, endpoints.view(-1, edges.shape[1]), mode="sum")
+        functional.leaky_relu_(update.addmm_(inputs, weight.to(dtype).T), LEAKY_RELU_SLOPE)
+        edges, for_edges = _add_and_norm(edges, update, edge_norm_weight, edge_norm_bias)
+
+        node_inputs = nodes.to(dtype)
+        mean = _sum_by_group(edges, graph.edges_by_receiver).mul_(graph.inverse_degree).to(dtype)
+        update = torch.addmm(node_bias.to(dtype), node_inputs, node_weight.to(dtype).T)
+        functional.leaky_relu_(update.addmm_(mean, message_weight.to(dtype).T), LEAKY_RELU_SLOPE)
+        nodes, for_nodes = _add_and_norm(nodes, update, node_norm_weight, node_norm_bias)
+        products = inputs, weight, node_inputs, node_weight, mean, message_weight
+        ctx.save_for_backward(*products, *for_edges, *for_nodes)
+        return nodes, edges
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = gradients
-        total = gradient.new_zeros(ctx.rows, gradient.shape[1])
-        for rows in ctx.graph.endpoint_rows.T.contiguous():
-            total.index_add_(0, rows, gradient)
-        return total, None
+    @once_differentiable
+    def backward(ctx: Any, of_nodes: Tensor, of_edges: Tensor | None) -> tuple[Tensor | None, ...]:
+        inputs, weight, node_inputs, node_weight, mean, message_weight, *saved = ctx.saved_tensors
+        of_nodes, of_update, *of_node_norm = _add_and_norm_backward(of_nodes, *saved[6:])
+        of_node_linear = of_update.T @ node_inputs, of_update.sum(0), of_update.T @ mean
+        of_nodes.addmm_(of_update.to(of_nodes.dtype), node_weight.to(of_nodes.dtype))
+        of_mean = (of_update @ message_weight.to(of_update.dtype)).mul_(ctx.graph.inverse_degree)
+
+        received = of_mean.index_select(0, ctx.graph.receivers)
+        if of_edges is not None:  # nobody reads those of the last block
+            received = received.to(of_edges.dtype).add_(of_edges)
+        of_edges, of_update, *of_edge_norm = _add_and_norm_backward(received, *saved[:6])
+        of_endpoints = _sum_by_group(of_update, ctx.graph.edges_by_endpoint_row).view(len(mean), -1)
+        of_weight = of_update.T @ inputs
+        of_inputs = None
+        if ctx.recurrent:
+            of_edges.addmm_(of_update.to(of_edges.dtype), weight.to(of_edges.dtype))
+        elif ctx.needs_input_grad[2]:
+            of_inputs = of_update @ weight.to(of_update.dtype)
+        of_products = of_inputs, of_weight, of_endpoints
+        return of_nodes, of_edges, *of_products, *of_edge_norm, *of_node_linear, *of_node_norm, None
+
+
+def _sum_by_group(edges: Tensor, groups: tuple[Tensor, Tensor]) -> Tensor:
+    """Sums of edges, shape [groups, width]; `index_add` takes three times as long."""
+    order, starts = groups
+    return functional.embedding_bag(order, edges, starts, mode="sum")
+
+
+def _add_and_norm(
+    before: Tensor, update: Tensor, weight: Tensor, bias: Tensor
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """LN(before + update), and what `_add_and_norm_backward` takes after the gradient."""
+    total = before + update
+    if total.is_cuda:
+        total = total.float()  # as autocast does there
+    normed, mean, inverse_deviation = torch.native_layer_norm(total, weight.shape, weight, bias, 1e-5)
+    return normed, (update, total, mean, inverse_deviation, weight, bias)
+
+
+def _add_and_norm_backward(
+    gradient: Tensor,
+    update: Tensor,
+    total: Tensor,
+    mean: Tensor,
+    inverse_deviation: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of `before`, of what was activated to `update` (and is written there), of weight and bias."""
+    of_total, of_weight, of_bias = torch.ops.aten.native_layer_norm_backward(
+        gradient.to(total.dtype), total, weight.shape, mean, inverse_deviation, weight, bias, [True] * 3
+    )
+    of_update = torch.ops.aten.leaky_relu_backward(
+        of_total.to(update.dtype), update, LEAKY_RELU_SLOPE, True, grad_input=update
+    )
+    return of_total, of_update, of_weight, of_bias
 
 
 class MessagePassingBlock(nn.Module):
@@ -54,37 +140,28 @@ class MessagePassingBlock(nn.Module):
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
         """Update nodes [nodes, width] and edges [edges, width]."""
-        product = (edges, self.edge_linear.weight, self.edge_linear.bias)
-        return self.update(nodes, edges, self.endpoint_linear(nodes), product, graph)
+        bias = _of_senders(self.edge_linear.bias)
+        endpoints = functional.linear(nodes, self.endpoint_linear.weight, bias)
+        return self.exchange(nodes, edges, None, self.edge_linear.weight, endpoints, graph)
 
-    def update(
+    def exchange(
         self,
         nodes: Tensor,
         edges: Tensor,
+        inputs: Tensor | None,
+        weight: Tensor,
         endpoints: Tensor,
-        product: tuple[Tensor, Tensor, Tensor],
         graph: Graph,
     ) -> tuple[Tensor, Tensor]:
-        """Update nodes and edges.
-
-        Args:
-            nodes, edges: shape [nodes, width] and [edges, width].
-            endpoints: the products of W_s and W_r with nodes, shape [nodes, 2 width].
-            product: x, A and c with A x + c = W_e e + b_e on every edge.
-            graph: the graph.
-        """
-        inputs, weight, bias = product
-        # In place where autograd allows it, and c added to nodes, of which there are fewer than edges: on a CPU this
-        # is bound by memory, not by arithmetic.
-        endpoints = endpoints + functional.pad(bias, (0, len(bias)))
-        message = cast(Tensor, _SumOfEndpoints.apply(endpoints.view(-1, len(bias)), graph))
-        message.addmm_(inputs.to(message.dtype), weight.to(message.dtype).T)
-        edges = self.edge_norm(edges + functional.leaky_relu_(message))
-        # Under autocast on CUDA, edges are float32 after the norm, and nodes need not be.
-        summed = edges.new_zeros(nodes.shape).index_add_(0, graph.receivers, edges)
-        update = self.node_linear(nodes)
-        update += self.message_linear(summed * graph.inverse_degree)
-        return self.node_norm(nodes + functional.leaky_relu_(update)), edges
+        """The same from what `_Exchange` says."""
+        edge_norm, node_norm = (
+            (self.edge_norm.weight, self.edge_norm.bias),
+            (self.node_norm.weight, self.node_norm.bias),
+        )
+        node_linear = self.node_linear.weight, self.node_linear.bias, self.message_linear.weight
+        products = inputs, weight, endpoints
+        updated = _Exchange.apply(nodes, edges, *products, *edge_norm, *node_linear, *node_norm, graph)
+        return cast(tuple[Tensor, Tensor], updated)
 
 
 class MessagePassingNetwork(nn.Module):
@@ -115,11 +192,10 @@ class MessagePassingNetwork(nn.Module):
         first, *others = cast(Iterable[MessagePassingBlock], self.blocks)
         # Inputs are many and short, so a product of weights saves one with each of them.
         weight, bias = _composed(first.edge_linear.weight, self.embed_edges)
-        endpoints = functional.linear(
-            graph.node_features, *_composed(first.endpoint_linear.weight, self.embed_nodes)
-        )
-        product = (graph.edge_features, weight, bias + first.edge_linear.bias)
-        nodes, edges = first.update(nodes, edges, endpoints, product, graph)
+        endpoint_weight, endpoint_bias = _composed(first.endpoint_linear.weight, self.embed_nodes)
+        endpoint_bias = endpoint_bias + _of_senders(bias + first.edge_linear.bias)
+        endpoints = functional.linear(graph.node_features, endpoint_weight, endpoint_bias)
+        nodes, edges = first.exchange(nodes, edges, graph.edge_features, weight, endpoints, graph)
         for block in others:
             nodes, edges = block(nodes, edges, graph)
         outputs = self.readout(functional.leaky_relu(self.hidden(nodes)))
@@ -129,3 +205,8 @@ class MessagePassingNetwork(nn.Module):
 def _composed(weight: Tensor, inner: nn.Linear) -> tuple[Tensor, Tensor]:
     """Weight and bias of the layer that multiplies the output of `inner`."""
     return weight @ inner.weight, weight @ inner.bias
+
+
+def _of_senders(bias: Tensor) -> Tensor:
+    """A bias of edges as one of endpoints: added to nodes as senders, of which there are fewer than edges."""
+    return functional.pad(bias, (0, len(bias)))
