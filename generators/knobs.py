@@ -53,6 +53,8 @@ class Knobs:
         cell_sizes: of their meshes, relative to the first.
         with_fine_steps: the companion of a level.
         full_length: settings of which whole trajectories are timed; of others, the cost of a frame is measured.
+        models_by: the fidelity that judges models, over all frames after their context, where contexts outlast the
+            window and the reference cannot be run to the end; None: the reference, in the window.
     """
 
     draws: tuple[int, ...]
@@ -66,6 +68,7 @@ class Knobs:
     with_fine_steps: Callable[[Any], Any]
     timed_frames: int = 0
     full_length: Callable[[Setting], bool] = lambda setting: True
+    models_by: str | None = None
 
 
 def _fidelities(scene: Any) -> tuple[Setting, ...]:
@@ -233,6 +236,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
         full_length=lambda setting: (
             setting.knob != "solver" and setting.level.parts == 1 and setting.level.element != "quadratic"
         ),
+        models_by="reference",
     )
 
 

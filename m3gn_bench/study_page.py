@@ -191,6 +191,12 @@ def _tradeoff(study: TradeOff) -> str:
             ),
             _row(["---", "--:", "--:", "--:", "--:", "--:", "--:", "---"]),
         ]
+        if study.models_by is not None:
+            lines[-2:-2] = [
+                f"Models are judged on all frames after their context, by fidelity {study.models_by}: the finest mesh "
+                "takes too long for that. So are the simulators that they pay off against.",
+                "",
+            ]
     for m in study.models:
         after = "never" if m.pays_off_after is None else f"{m.pays_off_after} ({m.pays_off_with_data})"
         shares = [_percent(e) for e in (m.error, m.error_to_data, m.error_of_data)]

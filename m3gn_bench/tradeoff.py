@@ -6,7 +6,9 @@ has, so the error of that data stands beside the model's own.
 
 The error of a trajectory is the root mean square distance of its nodes from the reference over a window of
 frames, divided by the root mean square displacement of the reference from rest or by the object's size. For a
-model only the window's frames after the anchor count. Times are CPU seconds of one thread for a whole trajectory.
+model only the window's frames after the anchor count; where contexts outlast the window, because the finest mesh
+cannot be run for long, all frames after the anchor count, judged by a fidelity that can. Times are CPU seconds of one
+thread for a whole trajectory.
 """
 
 import math
@@ -120,7 +122,13 @@ class Convergence(Record):
 
 
 class TradeOff(Record):
-    """The whole study of a task."""
+    """The whole study of a task.
+
+    Attributes:
+        window: first and last frame by which simulators are judged.
+        models_by: the fidelity that judges models, on all frames after their context; None: the reference, in the
+            window.
+    """
 
     task: str
     scene: str
@@ -129,6 +137,7 @@ class TradeOff(Record):
     machine: str
     draws: tuple[str, ...]
     window: tuple[int, int]
+    models_by: str | None = None
     unit: str
     convergence: Convergence
     simulators: tuple[Simulated, ...]
@@ -201,12 +210,7 @@ def measure(
         {
             "task": task.name,
             "dataset_version": scene.dataset_version,
-            "knobs": repr(
-                [
-                    getattr(knobs, name)
-                    for name in ("draws", "first", "last", "frames", "timed_frames", "settings", "meshes")
-                ]
-            ),
+            "knobs": repr([value for value in vars(knobs).values() if not callable(value)]),
             "simulators": scene.simulator_versions(),
             "machine": bench.machine,
         },
@@ -225,7 +229,6 @@ def measure(
     models = [
         _pay_off(
             bench.predicted(results, one, context, 60 * description.minutes),
-            # On the frames that the model is judged by.
             bench.simulators(results, max(context, knobs.first)),
             data_seconds,
         )
@@ -240,6 +243,7 @@ def measure(
         machine=bench.machine,
         draws=tuple(trajectory_key("test", index) for index in knobs.draws),
         window=(knobs.first, knobs.last),
+        models_by=knobs.models_by,
         unit="displacement" if knobs.size is None else "size of the object",
         convergence=bench.convergence(results),
         simulators=tuple(simulators),
@@ -338,6 +342,18 @@ class Bench:
             for level in compared
             for i in self.knobs.draws
         ]
+        if shipped and self.knobs.models_by is not None:
+            judge = self.scene.fidelities[self.knobs.models_by]
+            cells += [
+                Cell(
+                    _judge_name(i),
+                    partial(
+                        untimed, self.scene.name, self.parameters[i], judge, self.scene.frames, slice(None)
+                    ),
+                    timed=False,
+                )
+                for i in self.knobs.draws
+            ]
         return cells
 
     def _companion(self, setting: "Setting") -> Any:
@@ -364,7 +380,11 @@ class Bench:
         problems = scene.check(trajectory) if full else []
         return Result(
             {"refused": "; ".join(problems) or None, "seconds": seconds},
-            {"positions": self._window(trajectory.positions), "rest": trajectory.mesh.rest_positions},
+            {
+                "positions": self._window(trajectory.positions),
+                "rest": trajectory.mesh.rest_positions,
+                **({"all": trajectory.positions} if self.knobs.models_by and full else {}),
+            },
         )
 
     def _timed_again(self, setting: "Setting", index: int, number: int, study: Study) -> Result:
@@ -424,28 +444,40 @@ class Bench:
     def _reference(self, results: dict[str, Result], index: int, level: int = -1) -> np.ndarray:
         return results[_untimed_name(self.knobs.meshes[level], index)].arrays["positions"]
 
-    def _unit(self, results: dict[str, Result], index: int, first: int) -> float:
+    def _judge(self, results: dict[str, Result], index: int, first: int) -> np.ndarray:
+        """The nodes by which models are judged, from frame `first` on."""
+        if self.knobs.models_by is not None:
+            return results[_judge_name(index)].arrays["positions"][first:]
+        return self._reference(results, index)[first - self.knobs.first :]
+
+    def _unit(self, results: dict[str, Result], index: int, reference: np.ndarray) -> float:
         if self.knobs.size is not None:
             return self.knobs.size
-        rest = results[f"fidelity: default {index}"].arrays["rest"]
-        return distance(self._reference(results, index)[first - self.knobs.first :], rest)
+        return distance(reference, results[f"fidelity: default {index}"].arrays["rest"])
 
     def simulators(self, results: dict[str, Result], first: int | None = None) -> list[Simulated]:
-        """Means of every setting over the draws that are not refused, from frame `first` on (the window's, if None)."""
+        """Means of every setting over the draws that are not refused.
+
+        In the window, or on the frames that a model is judged by which begins at frame `first`: then without settings
+        that were not run to the end if it is judged to the end, and without parts.
+        """
+        to_the_end = first is not None and self.knobs.models_by is not None
         found = []
         for setting in self.knobs.settings:
+            if to_the_end and not self.knobs.full_length(setting):
+                continue
             made = {i: results[f"{setting.name} {i}"] for i in self.knobs.draws}
             good = [i for i, result in made.items() if result.values["refused"] is None]
-            errors = np.array([self._split(results, setting, i, first) for i in good]).reshape(-1, 3)
-            total, steps, mesh = errors.mean(0).tolist() if good else (None, None, None)
+            errors = np.array([self._errors(results, setting, i, first) for i in good])
+            total, steps, mesh = (*(errors.mean(0).tolist() if good else ()), None, None, None)[:3]
             found.append(
                 Simulated(
                     knob=setting.knob,
                     label=setting.label,
                     seconds=statistics.mean(self._least(results, setting, i) for i in good) if good else None,
                     error=total,
-                    error_of_steps=None if setting.options else steps,
-                    error_of_mesh=None if setting.options else mesh,
+                    error_of_steps=steps,
+                    error_of_mesh=mesh,
                     extrapolated=not self.knobs.full_length(setting),
                     refused=tuple(r.values["refused"] for r in made.values() if r.values["refused"]),
                 )
@@ -457,18 +489,28 @@ class Bench:
         names = [f"{setting.name} {index}", *(_again_name(setting, index, r) for r in range(1, ROUNDS))]
         return min(s for name in names if (s := results[name].values["seconds"]) is not None)
 
-    def _split(
+    def _errors(
         self, results: dict[str, Result], setting: "Setting", index: int, first: int | None
-    ) -> tuple[float, float, float]:
-        """Error, and its parts by steps and by mesh (no parts for another solver, which has no companion)."""
-        first = self.knobs.first if first is None else first
-        window = slice(first - self.knobs.first, None)
-        unit, reference = self._unit(results, index, first), self._reference(results, index)[window]
-        positions = results[f"{setting.name} {index}"].arrays["positions"][window]
+    ) -> tuple[float, ...]:
+        """Error in the window, and its parts by steps and by mesh (but of another solver, which has no companion).
+
+        From frame `first` on, if it is not None, against what judges models, and without parts.
+        """
+        found = results[f"{setting.name} {index}"].arrays
+        if first is not None:
+            judge = self._judge(results, index, first)
+            positions = (
+                found["all"][first:]
+                if self.knobs.models_by
+                else found["positions"][first - self.knobs.first :]
+            )
+            return (distance(positions, judge) / self._unit(results, index, judge),)
+        reference, positions = self._reference(results, index), found["positions"]
+        unit = self._unit(results, index, reference)
         total = distance(positions, reference) / unit
         if setting.options:
-            return total, math.nan, math.nan
-        companion = results[_untimed_name(self._companion(setting), index)].arrays["positions"][window]
+            return (total,)
+        companion = results[_untimed_name(self._companion(setting), index)].arrays["positions"]
         return total, distance(positions, companion) / unit, distance(companion, reference) / unit
 
     def predicted(
@@ -479,10 +521,10 @@ class Bench:
         errors, seconds = [], []
         for i in self.knobs.draws:
             result = results[f"{_model_name(one)} {context} {i}"]
-            window = slice(first - context, self.knobs.last + 1 - context)
+            truth = self._judge(results, i, first)
+            window = slice(first - context, first - context + len(truth))
             positions, data = (result.arrays[name][window] for name in ("positions", "data"))
-            truth = self._reference(results, i)[first - self.knobs.first :]
-            unit = self._unit(results, i, first)
+            unit = self._unit(results, i, truth)
             errors.append(
                 [distance(a, b) / unit for a, b in ((positions, truth), (positions, data), (data, truth))]
             )
@@ -505,7 +547,7 @@ class Bench:
         distances = [
             statistics.mean(
                 distance(self._reference(results, i, a), self._reference(results, i, b))
-                / self._unit(results, i, self.knobs.first)
+                / self._unit(results, i, self._reference(results, i))
                 for i in self.knobs.draws
             )
             for a, b in pairs
@@ -540,6 +582,10 @@ def _model_name(one: Shipped) -> str:
 
 def _again_name(setting: "Setting", index: int, number: int) -> str:
     return f"{setting.name} {index}, round {number}"
+
+
+def _judge_name(index: int) -> str:
+    return f"judge of models {index}"
 
 
 def _untimed_name(level: Any, index: int) -> str:

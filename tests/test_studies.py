@@ -9,21 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 
 from m3gn_bench import stability, study_commands, tradeoff
+from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cli import cli
+from m3gn_bench.data import case_from
+from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.figures import save
 from m3gn_bench.generators.deformable_block import DeformableBlock
 from m3gn_bench.generators.extremes import Extreme, Extremes, extremes_of
+from m3gn_bench.generators.generate import draw as draw_parameters
 from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
 from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.stability import MODEL_CELLS, REASONED
-from m3gn_bench.studies import Cell, Result, Shipped, Study
+from m3gn_bench.studies import Cell, Result, Shipped, Study, distance
 from m3gn_bench.study_page import draw, is_converged, read_records, render
 from m3gn_bench.tasks import TASKS, get_task
 
@@ -142,6 +147,11 @@ def test_knobs_are_sound(name: str) -> None:
     assert "fidelity: default" in names
     assert len(set(names)) == len(names)
     assert sorted(knobs.cell_sizes, reverse=True) == list(knobs.cell_sizes)
+    # Something judges what models predict, whatever the context.
+    assert (
+        knobs.models_by in get_scene(TASKS[name].scene).fidelities
+        or max(TASKS[name].context_sizes) <= knobs.last
+    )
 
 
 BLOCK = next(cell for cell in extremes_of("deformable_block").cells if cell.name == "lowest fidelity")
@@ -258,6 +268,32 @@ def test_commands_measure_record_and_render(tmp_path: Path) -> None:
     assert run("render-studies", str(docs), "--check")[0] == 1
     with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
         save(draw(result), tmp_path / "figure.xyz")
+
+
+def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path: Path) -> None:
+    """Errors are those that follow from trajectories and predictions made here."""
+    knobs = replace(SMALL, last=3, frames=4, models_by="reference")
+    result, _ = tradeoff.measure(TASK, [M3GN], tmp_path, knobs=knobs)
+    scene = SheetDeformation()
+    parameters = draw_parameters(scene, "test", knobs.draws[0], DATASET_SEED)
+    data, truth = (scene.simulate(parameters, fidelity) for fidelity in ("default", "reference"))
+    case = case_from(TASK, scene, data, "test_00004")
+    model, _ = load_checkpoint(M3GN.folder)
+    for predicted in result.models:
+        with torch.inference_mode():
+            path = model.predict(case.context(predicted.context)).double().numpy()
+        path = path * scene.scale_length + np.array(scene.scale_centre)
+        judge = truth.positions[predicted.context :]
+        unit = distance(judge, truth.mesh.rest_positions)
+        assert predicted.error == pytest.approx(distance(path, judge) / unit, rel=1e-5)
+        of_data = distance(data.positions[predicted.context :], judge) / unit
+        assert predicted.error_of_data == pytest.approx(of_data, rel=1e-5)
+        assert predicted.rival is not None
+    lines = render([result], []).splitlines()
+    assert any(line.startswith("Models are judged on all frames") for line in lines)
+    assert lines.index("| --- | --: | --: | --: | --: | --: | --: | --- |") == 1 + next(
+        number for number, line in enumerate(lines) if line.startswith("| model | context |")
+    )
 
 
 def assert_sound(result: tradeoff.TradeOff) -> None:
