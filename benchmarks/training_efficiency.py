@@ -69,6 +69,8 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
     "four and all pairs": ({"training.batch_size": 4, "model.max_training_context_pairs": None}, None),
     "eight trajectories per step": ({"training.batch_size": 8}, None),
     "eight and all pairs": ({"training.batch_size": 8, "model.max_training_context_pairs": None}, None),
+    "sixteen trajectories per step": ({"training.batch_size": 16}, None),
+    "sixteen and all pairs": ({"training.batch_size": 16, "model.max_training_context_pairs": None}, None),
     "four and one pair": ({"training.batch_size": 4, "model.max_training_context_pairs": 1}, None),
     "bfloat16 products": ({"training.precision": "bfloat16"}, None),
     "constant learning rate": ({"training.cosine_decay": False}, None),

@@ -51,18 +51,18 @@ class Graph:
 
     @cached_property
     def edges_by_receiver(self) -> tuple[Tensor, Tensor]:
-        """Edges in the order of their receivers, shape [edges], and where each node's begin, shape [nodes]."""
+        """Edges grouped by receiver, shape [edges], and where each node's begin, shape [nodes]."""
         return _by_group(self.receivers, len(self.node_features))
 
     @cached_property
     def edges_by_endpoint_row(self) -> tuple[Tensor, Tensor]:
-        """Edges in the order of `endpoint_rows`, shape [2 edges], and where each row's begin, shape [2 nodes]."""
+        """Edges grouped by the rows of `endpoint_rows`, shape [2 edges], and where each row's begin, [2 nodes]."""
         ends, starts = _by_group(self.endpoint_rows.flatten(), 2 * len(self.node_features))
         return ends // 2, starts
 
 
 def _by_group(groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Members in the order of their groups, and where each of `count` groups begins."""
+    """Members grouped, those of a group in order, and where each of `count` groups begins."""
     members = np.arange(len(groups))
     # Counts instead of sorting, which takes five times as long.
     table = coo_array(

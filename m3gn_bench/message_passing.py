@@ -20,7 +20,8 @@ from torch.nn import functional
 
 from m3gn_bench.graph import Graph
 
-LEAKY_RELU_SLOPE = 0.01
+LEAKY_RELU_SLOPE = 0.01  # torch's own, as the next
+LAYER_NORM_EPS = 1e-5
 
 
 class _Exchange(torch.autograd.Function):
@@ -68,26 +69,38 @@ class _Exchange(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, of_nodes: Tensor, of_edges: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, of_nodes: Tensor | None, of_edges: Tensor | None) -> tuple[Tensor | None, ...]:
         inputs, weight, node_inputs, node_weight, mean, message_weight, *saved = ctx.saved_tensors
-        of_nodes, of_update, *of_node_norm = _add_and_norm_backward(of_nodes, *saved[6:])
+        for_edges, for_nodes = saved[:6], saved[6:]
+        if of_nodes is None:  # nobody reads the nodes
+            of_nodes = torch.zeros_like(for_nodes[0])
+        of_nodes, of_update, *of_node_norm = _add_and_norm_backward(of_nodes, *for_nodes)
         of_node_linear = of_update.T @ node_inputs, of_update.sum(0), of_update.T @ mean
-        of_nodes.addmm_(of_update.to(of_nodes.dtype), node_weight.to(of_nodes.dtype))
+        _add_product(of_nodes, of_update, node_weight)
         of_mean = (of_update @ message_weight.to(of_update.dtype)).mul_(ctx.graph.inverse_degree)
 
         received = of_mean.index_select(0, ctx.graph.receivers)
-        if of_edges is not None:  # nobody reads those of the last block
+        if of_edges is not None:  # as it is for the last block, whose edges nobody reads
             received = received.to(of_edges.dtype).add_(of_edges)
-        of_edges, of_update, *of_edge_norm = _add_and_norm_backward(received, *saved[:6])
+        of_edges, of_update, *of_edge_norm = _add_and_norm_backward(received, *for_edges)
         of_endpoints = _sum_by_group(of_update, ctx.graph.edges_by_endpoint_row).view(len(mean), -1)
         of_weight = of_update.T @ inputs
         of_inputs = None
         if ctx.recurrent:
-            of_edges.addmm_(of_update.to(of_edges.dtype), weight.to(of_edges.dtype))
+            _add_product(of_edges, of_update, weight)
         elif ctx.needs_input_grad[2]:
             of_inputs = of_update @ weight.to(of_update.dtype)
         of_products = of_inputs, of_weight, of_endpoints
         return of_nodes, of_edges, *of_products, *of_edge_norm, *of_node_linear, *of_node_norm, None
+
+
+def _add_product(total: Tensor, left: Tensor, right: Tensor) -> None:
+    """Add left @ right in place; the product has the precision of `left`, also under autocast."""
+    right = right.to(left.dtype)
+    if total.dtype == left.dtype:
+        total.addmm_(left, right)
+    else:
+        total += left @ right
 
 
 def _sum_by_group(edges: Tensor, groups: tuple[Tensor, Tensor]) -> Tensor:
@@ -102,8 +115,10 @@ def _add_and_norm(
     """LN(before + update), and what `_add_and_norm_backward` takes after the gradient."""
     total = before + update
     if total.is_cuda:
-        total = total.float()  # as autocast does there
-    normed, mean, inverse_deviation = torch.native_layer_norm(total, weight.shape, weight, bias, 1e-5)
+        total = total.to(weight.dtype)  # as autocast does there
+    normed, mean, inverse_deviation = torch.native_layer_norm(
+        total, weight.shape, weight, bias, LAYER_NORM_EPS
+    )
     return normed, (update, total, mean, inverse_deviation, weight, bias)
 
 
@@ -153,7 +168,7 @@ class MessagePassingBlock(nn.Module):
         endpoints: Tensor,
         graph: Graph,
     ) -> tuple[Tensor, Tensor]:
-        """The same from what `_Exchange` says."""
+        """The same, given the products of which `_Exchange` makes the message."""
         edge_norm, node_norm = (
             (self.edge_norm.weight, self.edge_norm.bias),
             (self.node_norm.weight, self.node_norm.bias),

@@ -115,7 +115,8 @@ def tradeoff(
             ],
         ),
         table(
-            f"{task.title}: learned models, error [%]",
+            f"{task.title}: learned models, error [%]"
+            + ("" if result.models_by is None else f", to the end, by fidelity {result.models_by}"),
             ["model, context", "time [s]", "error", "to the data", "of the data", "front", "pays off after"],
             [
                 [

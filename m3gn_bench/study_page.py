@@ -124,10 +124,12 @@ def advice(study: TradeOff) -> list[str]:
             + f"; {_name(fastest)} is as accurate and takes {fastest.seconds:.2g} s instead of {default.seconds:.2g} s."
         )
     if not study.models:
-        third = "No trained model of this task ships with the project yet."
+        third = "No trained model took part."
     else:
         best_model = min(study.models, key=lambda m: m.error)
         third = f"The most accurate model, {_name(best_model)}, is off by {_percent(best_model.error)}"
+        if study.models_by is not None:
+            third += f" from fidelity {study.models_by} over the rest of the trajectory"
         if best_model.rival is None:
             third += "; no simulator is as accurate."
         elif best_model.pays_off_after is None:
@@ -174,6 +176,13 @@ def _tradeoff(study: TradeOff) -> str:
         shares = [_percent(e) for e in (s.error, s.error_of_steps, s.error_of_mesh)]
         seconds = "" if s.seconds is None else f"{'≈ ' * s.extrapolated}{s.seconds:.3g}"
         lines.append(_row([_name(s), seconds, *shares, front]))
+    if study.models_by is not None and study.models:
+        lines += [
+            "",
+            f"Models are judged on all frames after their context, by fidelity `{study.models_by}`, because the finest "
+            "mesh cannot be run so far; so are the simulators against which they pay off. None is on the front, which "
+            "is of errors in the window.",
+        ]
     if study.models:
         lines += [
             "",
@@ -191,12 +200,6 @@ def _tradeoff(study: TradeOff) -> str:
             ),
             _row(["---", "--:", "--:", "--:", "--:", "--:", "--:", "---"]),
         ]
-        if study.models_by is not None:
-            lines[-2:-2] = [
-                f"Models are judged on all frames after their context, by fidelity {study.models_by}: the finest mesh "
-                "takes too long for that. So are the simulators that they pay off against.",
-                "",
-            ]
     for m in study.models:
         after = "never" if m.pays_off_after is None else f"{m.pays_off_after} ({m.pays_off_with_data})"
         shares = [_percent(e) for e in (m.error, m.error_to_data, m.error_of_data)]
@@ -251,7 +254,7 @@ def draw(study: TradeOff) -> "Figure":
             [m.error for m in ones],
             marker="^",
             zorder=3,
-            label=f"{name}, by context",
+            label=f"{name}, by context" + ("" if study.models_by is None else ", to the end"),
             color=next(colours),
         )
         for m in ones:

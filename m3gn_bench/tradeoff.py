@@ -1,7 +1,7 @@
 """Speed against accuracy: every way to get a trajectory of a task, in one run on one machine.
 
-All are judged by one reference, the finest of three meshes (see `generators.knobs`): simulators at every setting
-of every knob, and learned models at every context size. A model is given the context that the benchmark's dataset
+Judged by one reference, the finest of three meshes (see `generators.knobs`), are simulators at every setting of every
+knob, and learned models at every context size. A model is given the context that the benchmark's dataset
 has, so the error of that data stands beside the model's own.
 
 The error of a trajectory is the root mean square distance of its nodes from the reference over a window of
@@ -79,9 +79,9 @@ class Predicted(Record):
 
     Attributes:
         seconds: per trajectory predicted by itself, context encoding included.
-        error: distance from the reference.
+        error: distance from the reference, or from what else judges models (`TradeOff.models_by`).
         error_to_data: distance from the dataset's trajectory, the default fidelity's.
-        error_of_data: distance of that from the reference, over the same frames.
+        error_of_data: distance of that from the same judge, over the same frames.
         training_seconds: CPU seconds of training.
         rival: the fastest simulator setting that is at least as accurate, if there is one.
         pays_off_after: number of trajectories after which training has paid for itself against the rival;
@@ -158,7 +158,9 @@ class TradeOff(Record):
             (math.inf, math.inf) if s.refused else (finite(s.seconds), finite(s.error))
             for s in self.simulators
         ]
-        front = pareto_front([*totals, *((m.seconds, m.error) for m in self.models)])
+        # Errors over other frames, against another judge, are not to be compared.
+        models = [(m.seconds, m.error) for m in self.models] if self.models_by is None else []
+        front = pareto_front([*totals, *models])
         parts = pareto_front(
             [
                 (seconds, finite(s.error_of_steps), finite(s.error_of_mesh))
@@ -169,11 +171,11 @@ class TradeOff(Record):
             s.model_copy(update={"on_front": on, "on_front_by_parts": by_parts})
             for s, on, by_parts in zip(self.simulators, front, parts, strict=False)
         )
-        models = tuple(
-            m.model_copy(update={"on_front": on})
-            for m, on in zip(self.models, front[len(simulators) :], strict=True)
+        models_on_front = front[len(simulators) :] or [False] * len(self.models)
+        marked = tuple(
+            m.model_copy(update={"on_front": on}) for m, on in zip(self.models, models_on_front, strict=True)
         )
-        return self.model_copy(update={"simulators": simulators, "models": models})
+        return self.model_copy(update={"simulators": simulators, "models": marked})
 
 
 def measure(
@@ -211,6 +213,8 @@ def measure(
             "task": task.name,
             "dataset_version": scene.dataset_version,
             "knobs": repr([value for value in vars(knobs).values() if not callable(value)]),
+            "full_length": [setting.name for setting in knobs.settings if knobs.full_length(setting)],
+            "fidelities": repr(scene.fidelities),
             "simulators": scene.simulator_versions(),
             "machine": bench.machine,
         },
@@ -450,34 +454,38 @@ class Bench:
             return results[_judge_name(index)].arrays["positions"][first:]
         return self._reference(results, index)[first - self.knobs.first :]
 
+    def _judges(self, setting: "Setting") -> bool:
+        return (setting.knob, setting.label) == ("fidelity", self.knobs.models_by)
+
     def _unit(self, results: dict[str, Result], index: int, reference: np.ndarray) -> float:
         if self.knobs.size is not None:
             return self.knobs.size
         return distance(reference, results[f"fidelity: default {index}"].arrays["rest"])
 
     def simulators(self, results: dict[str, Result], first: int | None = None) -> list[Simulated]:
-        """Means of every setting over the draws that are not refused.
+        """Means of every setting over the draws that are not refused, in the window.
 
-        In the window, or on the frames that a model is judged by which begins at frame `first`: then without settings
-        that were not run to the end if it is judged to the end, and without parts.
+        Or, without parts, on the frames by which a model is judged that begins at frame `first`. Where that is to the
+        end, of settings that were run to the end, and of the judge.
         """
-        to_the_end = first is not None and self.knobs.models_by is not None
+        settings = self.knobs.settings
+        if first is not None and self.knobs.models_by is not None:
+            settings = tuple(s for s in settings if self.knobs.full_length(s) or self._judges(s))
         found = []
-        for setting in self.knobs.settings:
-            if to_the_end and not self.knobs.full_length(setting):
-                continue
+        for setting in settings:
             made = {i: results[f"{setting.name} {i}"] for i in self.knobs.draws}
             good = [i for i, result in made.items() if result.values["refused"] is None]
             errors = np.array([self._errors(results, setting, i, first) for i in good])
-            total, steps, mesh = (*(errors.mean(0).tolist() if good else ()), None, None, None)[:3]
+            names = ("error", "of steps", "of mesh")
+            means = dict(zip(names, errors.mean(0).tolist() if good else (), strict=False))
             found.append(
                 Simulated(
                     knob=setting.knob,
                     label=setting.label,
                     seconds=statistics.mean(self._least(results, setting, i) for i in good) if good else None,
-                    error=total,
-                    error_of_steps=steps,
-                    error_of_mesh=mesh,
+                    error=means.get("error"),
+                    error_of_steps=means.get("of steps"),
+                    error_of_mesh=means.get("of mesh"),
                     extrapolated=not self.knobs.full_length(setting),
                     refused=tuple(r.values["refused"] for r in made.values() if r.values["refused"]),
                 )
@@ -497,6 +505,8 @@ class Bench:
         From frame `first` on, if it is not None, against what judges models, and without parts.
         """
         found = results[f"{setting.name} {index}"].arrays
+        if first is not None and self._judges(setting):
+            return (0.0,)
         if first is not None:
             judge = self._judge(results, index, first)
             positions = (

@@ -272,8 +272,17 @@ def test_commands_measure_record_and_render(tmp_path: Path) -> None:
 
 def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path: Path) -> None:
     """Errors are those that follow from trajectories and predictions made here."""
-    knobs = replace(SMALL, last=3, frames=4, models_by="reference")
-    result, _ = tradeoff.measure(TASK, [M3GN], tmp_path, knobs=knobs)
+    judge_setting = Setting("fidelity", "reference", SheetDeformation.fidelities["reference"])
+    knobs = replace(
+        SMALL,
+        last=3,
+        frames=4,
+        settings=(*SMALL.settings, judge_setting),
+        timed_frames=8,
+        full_length=lambda setting: setting.knob == "fidelity" and setting.label == "default",
+        models_by="reference",
+    )
+    result, study = tradeoff.measure(TASK, [M3GN], tmp_path, knobs=knobs)
     scene = SheetDeformation()
     parameters = draw_parameters(scene, "test", knobs.draws[0], DATASET_SEED)
     data, truth = (scene.simulate(parameters, fidelity) for fidelity in ("default", "reference"))
@@ -288,7 +297,14 @@ def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path
         assert predicted.error == pytest.approx(distance(path, judge) / unit, rel=1e-5)
         of_data = distance(data.positions[predicted.context :], judge) / unit
         assert predicted.error_of_data == pytest.approx(of_data, rel=1e-5)
-        assert predicted.rival is not None
+        # Of what was run to the end the default is the faster, and it is more accurate than the model.
+        assert predicted.rival == "fidelity: default"
+        assert not predicted.on_front
+    assert result.default.on_front
+    better_than_default = result.models[0].model_copy(update={"error": result.models[0].error_of_data / 2})
+    rivals = tradeoff.Bench(TASK, scene, knobs).simulators(study.results, better_than_default.context)
+    assert [(r.label, r.error == 0) for r in rivals] == [("default", False), ("reference", True)]
+    assert tradeoff._pay_off(better_than_default, rivals, 0.0).rival == "fidelity: reference"
     lines = render([result], []).splitlines()
     assert any(line.startswith("Models are judged on all frames") for line in lines)
     assert lines.index("| --- | --: | --: | --: | --: | --: | --: | --- |") == 1 + next(
