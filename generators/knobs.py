@@ -215,8 +215,8 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
     return Knobs(
         draws=draws,
         first=contact,
-        last=contact + 3,  # the impact's first 0.04 s: a frame of the reference takes more than a minute
-        frames=contact + 4,
+        last=contact + 2,  # the impact's first 0.03 s: a frame of the reference takes more than a minute
+        frames=contact + 3,
         timed_frames=contact + 16,
         size=SIZE,
         settings=(

@@ -364,26 +364,20 @@ class Bench:
         return self.knobs.with_fine_steps(setting.level)
 
     def _timed(self, setting: "Setting", index: int) -> Result:
-        """CPU seconds of a whole trajectory, and its nodes in the window; or why it is refused."""
+        """CPU seconds (see `_time`), and the nodes in the window; or why it is refused."""
         from m3gn_bench.generators.errors import GeneratorError, SolverError
         from m3gn_bench.generators.scene import get_scene
 
         full = self.knobs.full_length(setting)
         try:
             scene = get_scene(self.task.scene, **setting.options)
-            frames = None if full else self.knobs.timed_frames
-            seconds, trajectory = self._run(scene, setting.level, index, frames)
-            if frames is not None:  # setting up costs once, frames cost each
-                short = self.knobs.first + 1
-                start, _ = self._run(scene, setting.level, index, short)
-                each = (seconds - start) / (frames - short)
-                seconds = start + each * (scene.frames - short)
+            times, trajectory = self._time(scene, setting, index)
         except (SolverError, GeneratorError) as error:  # not solved; or a library is not installed
-            return Result({"refused": str(error), "seconds": None})
+            return Result({"refused": str(error), "times": None})
         # A body that is seen in mid-impact only is not judged by how it ends.
         problems = scene.check(trajectory) if full else []
         return Result(
-            {"refused": "; ".join(problems) or None, "seconds": seconds},
+            {"refused": "; ".join(problems) or None, "times": times},
             {
                 "positions": self._window(trajectory.positions),
                 "rest": trajectory.mesh.rest_positions,
@@ -392,15 +386,29 @@ class Bench:
         )
 
     def _timed_again(self, setting: "Setting", index: int, number: int, study: Study) -> Result:
-        """CPU seconds of the same trajectory in a later round; None where earlier ones are enough, or it is refused."""
+        """CPU seconds in a later round; None where earlier ones are enough, or it is refused."""
         from m3gn_bench.generators.scene import get_scene
 
-        before = study.results[f"{setting.name} {index}"].values["seconds"]
-        enough = before is None or number * max(before, ENOUGH) >= LONG
-        if enough or not self.knobs.full_length(setting):
-            return Result({"seconds": None})
+        before = study.results[f"{setting.name} {index}"].values["times"]
+        if before is None or number * max(sum(before), ENOUGH) >= LONG:
+            return Result({"times": None})
         scene = get_scene(self.task.scene, **setting.options)
-        return Result({"seconds": self._run(scene, setting.level, index, None)[0]})
+        return Result({"times": self._time(scene, setting, index)[0]})
+
+    def _time(self, scene: "Scene", setting: "Setting", index: int) -> tuple[list[float], Any]:
+        """CPU seconds of the frames that are timed; and, where these are not all, of the first ones alone.
+
+        And the trajectory, as far as it was simulated.
+        """
+        if self.knobs.full_length(setting):
+            seconds, trajectory = self._run(scene, setting.level, index, None)
+            return [seconds], trajectory
+        seconds, trajectory = self._run(scene, setting.level, index, self.knobs.timed_frames)
+        return [seconds, self._run(scene, setting.level, index, self._first_frames)[0]], trajectory
+
+    @property
+    def _first_frames(self) -> int:
+        return self.knobs.first + 1
 
     def _run(self, scene: "Scene", level: Any, index: int, frames: int | None) -> tuple[float, Any]:
         """The least time of several runs: whatever else the machine does only adds to it."""
@@ -493,9 +501,15 @@ class Bench:
         return found
 
     def _least(self, results: dict[str, Result], setting: "Setting", index: int) -> float:
-        """The least time of all rounds."""
+        """CPU seconds of a whole trajectory, by the least times of all rounds."""
         names = [f"{setting.name} {index}", *(_again_name(setting, index, r) for r in range(1, ROUNDS))]
-        return min(s for name in names if (s := results[name].values["seconds"]) is not None)
+        rounds = [times for name in names if (times := results[name].values["times"]) is not None]
+        seconds, *first = (min(times) for times in zip(*rounds, strict=True))
+        if not first:
+            return seconds
+        # Setting up costs once, frames cost each.
+        each = (seconds - first[0]) / (self.knobs.timed_frames - self._first_frames)
+        return first[0] + each * (self.scene.frames - self._first_frames)
 
     def _errors(
         self, results: dict[str, Result], setting: "Setting", index: int, first: int | None

@@ -234,7 +234,7 @@ def test_an_interrupted_tradeoff_still_times_in_rounds(
             tradeoff.measure(TASK, [], tmp_path, knobs=SMALL)
     _, study = tradeoff.measure(TASK, [], tmp_path, knobs=SMALL)
     names = [f"{SMALL.settings[0].name} {index}, round 1" for index in SMALL.draws]
-    assert all(study.results[name].values["seconds"] for name in names)
+    assert all(study.results[name].values["times"] for name in names)
 
 
 @pytest.mark.usefixtures("small")
@@ -268,6 +268,16 @@ def test_commands_measure_record_and_render(tmp_path: Path) -> None:
     assert run("render-studies", str(docs), "--check")[0] == 1
     with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
         save(draw(result), tmp_path / "figure.xyz")
+
+
+def test_what_is_timed_in_part_is_extrapolated_from_the_least_times() -> None:
+    """Ten frames more cost two seconds, so the 49 of a whole trajectory cost 9.8 on top of the first two."""
+    knobs = replace(SMALL, timed_frames=12, full_length=lambda setting: False)
+    bench = tradeoff.Bench(TASK, SheetDeformation(), knobs)
+    rounds = [[5.0, 2.0], [4.0, 2.5], *[None] * (tradeoff.ROUNDS - 2)]
+    names = ["fidelity: default 4", *(f"fidelity: default 4, round {n}" for n in range(1, tradeoff.ROUNDS))]
+    results = {name: Result({"times": times}) for name, times in zip(names, rounds, strict=True)}
+    assert bench._least(results, knobs.settings[0], 4) == pytest.approx(2 + 0.2 * 49)
 
 
 def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path: Path) -> None:
