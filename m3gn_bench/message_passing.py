@@ -80,7 +80,7 @@ class _Exchange(torch.autograd.Function):
         of_mean = (of_update @ message_weight.to(of_update.dtype)).mul_(ctx.graph.inverse_degree)
 
         received = of_mean.index_select(0, ctx.graph.receivers)
-        if of_edges is not None:  # as it is for the last block, whose edges nobody reads
+        if of_edges is not None:  # None: the last block, whose edges nobody reads
             received = received.to(of_edges.dtype).add_(of_edges)
         of_edges, of_update, *of_edge_norm = _add_and_norm_backward(received, *for_edges)
         of_endpoints = _sum_by_group(of_update, ctx.graph.edges_by_endpoint_row).view(len(mean), -1)
