@@ -184,18 +184,11 @@ class TrajectorySimulator(nn.Module):
 
         times = (torch.arange(1, steps + 1, device=anchor.device) / unit).to(anchor.dtype)
         lower, upper = TAU_RANGE
-        counts = body.node_counts
-        trajectories = []
-        for logit, w, y, v in zip(
-            outputs[:, 0].split(counts),
-            weights.split(counts),
-            anchor.split(counts),
-            velocity.split(counts),
-            strict=True,
-        ):
-            tau = lower + (upper - lower) * torch.sigmoid(logit.mean())
-            trajectories.append(self.primitives(times, tau, w, y, v * unit))
-        return hold_fixed(context, torch.cat(trajectories, dim=1))
+        logits = torch.stack([of_body.mean() for of_body in outputs[:, 0].split(body.node_counts)])
+        responses = self.primitives.responses(times, lower + (upper - lower) * torch.sigmoid(logits))
+        parts = (values.split(body.node_counts) for values in (weights, velocity * unit))
+        movements = [self.primitives.movement(*of_body) for of_body in zip(responses, *parts, strict=True)]
+        return hold_fixed(context, anchor + torch.cat(movements, dim=1))
 
 
 class M3GN(TrajectoryModel):

@@ -52,7 +52,7 @@ class M3GNReplan(M3GN):
         start = size + segment * int(rng.integers(total - trained + 1))
         frames = min(trained * segment, case.frames - start)
         error = self._segments(case.context(start), latent, frames) - case.future(start)[:frames]
-        return (error[:, ~case.body.fixed] / self.displacement_scale).square().mean()
+        return self.mean_square(error, case.body)
 
     def prepare(self, cases: Sequence[Case]) -> None:
         """As every model, but displacements are those within a segment."""

@@ -105,21 +105,41 @@ class ProDMP(nn.Module):
         Returns:
             Positions, shape [times, ...].
         """
-        s = times / tau
+        return position + self.movement(self.responses(times, tau), weights, velocity)
+
+    def responses(self, times: Tensor, tau: Tensor) -> Tensor:
+        """What moves with each basis function, with the goal, and with the velocity at time 0.
+
+        Args:
+            times: in [0, 1], shape [times].
+            tau: time scales in TAU_RANGE, shape [...].
+
+        Returns:
+            Shape [..., times, functions + 2].
+        """
+        s = times / tau[..., None]
         a = self.decay
         fade = torch.exp(-a * s)
         goal = 1 - (1 + a * s) * fade
-        basis = torch.cat([self._interpolate(s), goal[:, None]], dim=-1)
-        free = (tau * s * fade).reshape(-1, *[1] * position.dim()) * velocity
-        with torch.autocast(times.device.type, enabled=False):  # positions need float32's digits
-            shaped = torch.tensordot(basis, weights, dims=([1], [-1]))
-        return position + free + shaped
+        free = tau[..., None] * s * fade
+        return torch.cat([self._interpolate(s), goal[..., None], free[..., None]], dim=-1)
+
+    def movement(self, responses: Tensor, weights: Tensor, velocity: Tensor) -> Tensor:
+        """Away from the position at time 0, shape [times, ...].
+
+        Args:
+            responses: for one tau, shape [times, functions + 2].
+            weights, velocity: see `forward`.
+        """
+        coefficients = torch.cat([weights, velocity[..., None]], dim=-1)
+        with torch.autocast(coefficients.device.type, enabled=False):  # positions need float32's digits
+            return torch.tensordot(responses, coefficients, dims=([1], [-1]))
 
     def _interpolate(self, s: Tensor) -> Tensor:
-        """Basis functions at scaled times, shape [times, functions]."""
+        """Basis functions at scaled times [...], shape [..., functions]."""
         place = s / TABLE_STEP
         left = place.detach().floor().long().clamp(0, len(self.values) - 2)
-        u = (place - left)[:, None]
+        u = (place - left)[..., None]
         v0, v1 = self.values[left], self.values[left + 1]
         d0, d1 = self.slopes[left] * TABLE_STEP, self.slopes[left + 1] * TABLE_STEP
         # Increments from v0 keep float32's digits where a basis function is flat.
