@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from results import Record, read_results, run_missing
 from rich.console import Console
@@ -81,7 +82,10 @@ VARIANTS: dict[str, tuple[dict[str, Any], Exchange | None]] = {
 
 
 def rates(task_name: str, variants: list[str], steps: int, data: Path) -> list[tuple[str, float]]:
-    """Steps per second of variants that take turns, so that whatever else the machine does meets all of them."""
+    """Steps per second of variants that take turns, so that whatever else the machine does meets all of them.
+
+    In a turn all have the same random numbers: trajectories and context of a step are the same.
+    """
     use_cpu(1)
     task = get_task(task_name)
     cases = load_cases(find_or_generate(task, "paper", data), task, "validation", "paper")
@@ -94,8 +98,9 @@ def rates(task_name: str, variants: list[str], steps: int, data: Path) -> list[t
             model.prepare(cases)
             runs[name] = training.Run(config, model, 0, Path(), {})
             runs[name].step(cases)
-    for _ in range(steps):
+    for turn in range(steps):
         for name, variant in runs.items():
+            variant.rng = np.random.default_rng(turn)
             with (VARIANTS[name][1] or nullcontext)():
                 start = time.process_time()
                 variant.step(cases)
@@ -149,7 +154,7 @@ def main() -> None:
         parser.error(f"unknown variants {sorted(unknown)}; known: {', '.join(VARIANTS)}")
     if options.turns is not None:
         for task in tasks:
-            rows = [[name, f"{r:.1f}"] for name, r in rates(task, variants, options.turns, options.data)]
+            rows = [[name, f"{r:.2f}"] for name, r in rates(task, variants, options.turns, options.data)]
             Console().print(table(f"{task}, one core", ["variant", "steps/s"], rows))
         return
     plan = [
