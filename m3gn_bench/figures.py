@@ -25,11 +25,14 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def require_drawable(path: Path) -> str:
-    """The format of a figure of that name. Raises ConfigError without matplotlib, or if it does not know the format."""
+    """The format of a figure of that name. Raises ConfigError if a library is missing or does not know it."""
     try:
+        import adjustText  # noqa: F401
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ConfigError("figures need matplotlib; pip install 'm3gn-bench[plot]'") from error
+        raise ConfigError(
+            f"figures need matplotlib and adjustText ({error}); pip install 'm3gn-bench[plot]'"
+        ) from error
     known = Figure().canvas.get_supported_filetypes()
     kind = path.suffix.removeprefix(".").lower()
     if kind not in known:

@@ -103,11 +103,12 @@ def require_extra() -> None:
     from m3gn_bench.errors import ConfigError
 
     try:
-        for library in ("jinja2", "markdown_it", "matplotlib"):
+        for library in ("jinja2", "markdown_it", "matplotlib", "adjustText"):
             import_module(library)
     except ImportError as error:
         raise ConfigError(
-            f"a report needs jinja2, markdown-it-py and matplotlib ({error}); pip install 'm3gn-bench[report]'"
+            f"a report needs jinja2, markdown-it-py, matplotlib and adjustText ({error}); "
+            "pip install 'm3gn-bench[report]'"
         ) from error
 
 

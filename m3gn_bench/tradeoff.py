@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 REPETITIONS = 5  # of a model's prediction
 # Simulations are timed in rounds, in turns with all others: a slow minute of the machine spoils one round at most.
-ROUNDS = 6
+ROUNDS = 10
 ENOUGH = 0.5  # seconds of simulations in a round, after which none is repeated
-LONG = 3.0  # seconds in rounds before, after which a setting takes part in no other
-# Closer ones count as equal. Ratios of two settings' times differed by up to 7 % between two studies on the same, quiet
-# machine; and of the margins between 5 and 25 % this one lies farthest from the ratios there are, so that two studies
-# gave the same fronts. Errors of the same size differ from draw to draw.
-TIME_MARGIN, ERROR_MARGIN = 1.12, 1.01
+LONG = 5.0  # seconds in rounds before, after which a setting takes part in no other
+# Closer ones count as equal (of times, see `Knobs.time_margin`). Errors of the same size differ from draw to draw.
+ERROR_MARGIN = 1.01
+# Of times one of which is extrapolated, because it comes from few runs: ratios differed by 1.4 between two studies.
+EXTRAPOLATED_MARGIN = 2.0
 
 
 class Simulated(Record):
@@ -128,6 +128,7 @@ class TradeOff(Record):
         window: first and last frame by which simulators are judged.
         models_by: the fidelity that judges models, on all frames after their context; None: the reference, in the
             window.
+        time_margin: times closer than this factor count as equal.
     """
 
     task: str
@@ -138,6 +139,7 @@ class TradeOff(Record):
     draws: tuple[str, ...]
     window: tuple[int, int]
     models_by: str | None = None
+    time_margin: float
     unit: str
     convergence: Convergence
     simulators: tuple[Simulated, ...]
@@ -147,6 +149,11 @@ class TradeOff(Record):
     def default(self) -> Simulated:
         """The benchmark's own fidelity."""
         return default_of(self.simulators)
+
+    def margin(self, way: Simulated | Predicted) -> float:
+        """The factor by which a time has to differ from this way's to count as another."""
+        extrapolated = isinstance(way, Simulated) and way.extrapolated
+        return EXTRAPOLATED_MARGIN if extrapolated else self.time_margin
 
     def with_front(self) -> "TradeOff":
         """The same with every way marked that lies on a front; refused settings do not."""
@@ -159,13 +166,15 @@ class TradeOff(Record):
             for s in self.simulators
         ]
         # Errors over other frames, against another judge, are not to be compared.
-        models = [(m.seconds, m.error) for m in self.models] if self.models_by is None else []
-        front = pareto_front([*totals, *models])
+        compared = self.models if self.models_by is None else ()
+        margins = [self.margin(way) for way in (*self.simulators, *compared)]
+        front = pareto_front([*totals, *((m.seconds, m.error) for m in compared)], margins)
         parts = pareto_front(
             [
                 (seconds, finite(s.error_of_steps), finite(s.error_of_mesh))
                 for s, (seconds, _) in zip(self.simulators, totals, strict=True)
-            ]
+            ],
+            margins[: len(self.simulators)],
         )
         simulators = tuple(
             s.model_copy(update={"on_front": on, "on_front_by_parts": by_parts})
@@ -248,6 +257,7 @@ def measure(
         draws=tuple(trajectory_key("test", index) for index in knobs.draws),
         window=(knobs.first, knobs.last),
         models_by=knobs.models_by,
+        time_margin=knobs.time_margin,
         unit="displacement" if knobs.size is None else "size of the object",
         convergence=bench.convergence(results),
         simulators=tuple(simulators),
@@ -260,17 +270,24 @@ def default_of(simulators: Sequence[Simulated]) -> Simulated:
     return next(s for s in simulators if (s.knob, s.label) == ("fidelity", "default"))
 
 
-def pareto_front(points: Sequence[tuple[float, ...]]) -> list[bool]:
-    """Which (seconds, error, ...) no other is better than: clearly in one respect, and clearly worse in none."""
+def pareto_front(points: Sequence[tuple[float, ...]], time_margins: Sequence[float]) -> list[bool]:
+    """Which (seconds, error, ...) no other is better than: clearly in one respect, and clearly worse in none.
 
-    def clearly_less(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-        margins = (TIME_MARGIN, *(ERROR_MARGIN for _ in one[1:]))
-        return any(a * margin < b for a, b, margin in zip(one, other, margins, strict=True))
+    Args:
+        points: what is compared.
+        time_margins: of each point; of two, the larger one says which seconds are clearly less.
+    """
 
-    def beats(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    def clearly_less(one: int, other: int) -> bool:
+        time_margin = max(time_margins[one], time_margins[other])
+        margins = (time_margin, *(ERROR_MARGIN for _ in points[one][1:]))
+        return any(a * margin < b for a, b, margin in zip(points[one], points[other], margins, strict=True))
+
+    def beats(one: int, other: int) -> bool:
         return clearly_less(one, other) and not clearly_less(other, one)
 
-    return [math.isfinite(sum(p)) and not any(beats(other, p) for other in points) for p in points]
+    numbers = range(len(points))
+    return [math.isfinite(sum(points[n])) and not any(beats(other, n) for other in numbers) for n in numbers]
 
 
 def observed_order(cell_sizes: Sequence[float], distances: tuple[float, float]) -> float | None:

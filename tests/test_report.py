@@ -256,7 +256,7 @@ def test_markdown_becomes_accessible_html() -> None:
     assert body.count("<thead>") == 1
 
 
-@pytest.mark.parametrize("missing", ["jinja2", "markdown_it", "matplotlib"])
+@pytest.mark.parametrize("missing", ["jinja2", "markdown_it", "matplotlib", "adjustText"])
 def test_the_extra_is_named(
     missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

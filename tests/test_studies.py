@@ -124,8 +124,13 @@ def test_no_order_where_nothing_converges() -> None:
 def test_pareto_front() -> None:
     """Beaten by what is clearly better in one respect and as good in the other; what has no error is on no front."""
     points = [(1.0, 1.0), (10.0, 1.0), (2.0, 0.5), (3.0, 0.6), (2.05, 0.504), (1.05, 2.0), (0.5, math.inf)]
-    assert tradeoff.pareto_front(points) == [True, False, True, False, True, False, False]
-    assert tradeoff.pareto_front([(1.0, 1.0, 1.0), (2.0, 1.0, 0.9), (2.0, 1.0, 1.0)]) == [True, True, False]
+    assert tradeoff.pareto_front(points, [1.1] * 7) == [True, False, True, False, True, False, False]
+    # What would be as fast as (1, 1), and less accurate, if times were less certain.
+    slower = (0.9, 1.1)
+    assert tradeoff.pareto_front([(1.0, 1.0), slower], [1.1, 1.1]) == [True, True]
+    assert tradeoff.pareto_front([(1.0, 1.0), slower], [1.1, 2.0]) == [True, False]
+    parts = [(1.0, 1.0, 1.0), (2.0, 1.0, 0.9), (2.0, 1.0, 1.0)]
+    assert tradeoff.pareto_front(parts, [1.1] * 3) == [True, True, False]
 
 
 # -- the grids ---------------------------------------------------------------------------------------------
@@ -310,7 +315,7 @@ def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path
         # Of what was run to the end the default is the faster, and it is more accurate than the model.
         assert predicted.rival == "fidelity: default"
         assert not predicted.on_front
-    assert result.default.on_front
+    assert any(simulated.on_front for simulated in result.simulators)
     better_than_default = result.models[0].model_copy(update={"error": result.models[0].error_of_data / 2})
     rivals = tradeoff.Bench(TASK, scene, knobs).simulators(study.results, better_than_default.context)
     assert [(r.label, r.error == 0) for r in rivals] == [("default", False), ("reference", True)]
@@ -396,6 +401,7 @@ def test_recorded_tradeoffs() -> None:
         assert not study.default.refused
         assert study.default.error
         assert study.default.on_front, study.task
+        assert study == study.with_front(), study.task  # its marks follow from its times and errors
         assert is_converged(study), study.task
         assert study.dataset_version == get_scene(study.scene).dataset_version, study.task
 

@@ -29,13 +29,12 @@ def test_tradeoff(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     Block off the front by parts: a tolerance of 1e-3 is better solved, and a sixth slower. By total error it stays. For
     such a comparison half the rounds are enough.
     """
-    monkeypatch.setattr(tradeoff, "TIME_MARGIN", 1.5)
     monkeypatch.setattr(tradeoff, "ROUNDS", 3)
     task, knobs = get_task(name), knobs_of(name)
     draws = knobs.draws[:1]
     cheap = tuple(s for s in knobs.settings if s.knob in ("fidelity", "tolerance", "time step"))
     models = shipped(name, "m3gn", "mgn") if name == "sheet_deformation" else []
-    some = replace(knobs, draws=draws, settings=cheap)
+    some = replace(knobs, draws=draws, settings=cheap, time_margin=1.5)
     result, study = tradeoff.measure(task, models, tmp_path / "state", knobs=some)
     study.finish()
     default = result.default
