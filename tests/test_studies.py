@@ -319,7 +319,10 @@ def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path
     better_than_default = result.models[0].model_copy(update={"error": result.models[0].error_of_data / 2})
     rivals = tradeoff.Bench(TASK, scene, knobs).simulators(study.results, better_than_default.context)
     assert [(r.label, r.error == 0) for r in rivals] == [("default", False), ("reference", True)]
-    assert tradeoff._pay_off(better_than_default, rivals, 0.0).rival == "fidelity: reference"
+    assert tradeoff._pay_off(better_than_default, rivals, 0.0, 1.2).rival == "fidelity: reference"
+    # Of two that are as fast as each other, noise does not choose.
+    first = rivals[1].model_copy(update={"label": "first", "seconds": 1.05 * (rivals[1].seconds or 0)})
+    assert tradeoff._pay_off(better_than_default, [first, rivals[1]], 0.0, 1.2).rival == "fidelity: first"
     lines = render([result], []).splitlines()
     assert any(line.startswith("Models are judged on all frames") for line in lines)
     assert lines.index("| --- | --: | --: | --: | --: | --: | --: | --- |") == 1 + next(
