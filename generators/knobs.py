@@ -48,13 +48,13 @@ class Knobs:
         frames: that a reference needs.
         timed_frames: of settings of which not the whole trajectory is timed; they show what a frame costs.
         size: what distances are divided by [the scene's unit of length]; None: by the displacement.
+        time_margin: times closer than this factor count as equal. It lies in the widest gap, below 1.5, between ratios of
+            times on which the front depends (three studies of each task), so that their noise does not change it.
         settings: all ways to simulate; "fidelity: default" is among them.
         meshes: three levels with fine steps, from coarse to fine; the last is the reference.
         cell_sizes: of their meshes, relative to the first.
         with_fine_steps: the companion of a level.
         full_length: settings of which whole trajectories are timed; of others, the cost of a frame is measured.
-        time_margin: times closer than this factor count as equal. It lies where no two settings are so far apart that
-            it matters, and farthest from where they are, so that noise in times changes no verdict.
         models_by: the fidelity that judges models, over all frames after their context, where contexts outlast the
             window and the reference cannot be run to the end; None: the reference, in the window.
     """
@@ -64,13 +64,13 @@ class Knobs:
     last: int
     frames: int
     size: float | None
+    time_margin: float
     settings: tuple[Setting, ...]
     meshes: tuple[Any, ...]
     cell_sizes: tuple[float, float, float]
     with_fine_steps: Callable[[Any], Any]
     timed_frames: int = 0
     full_length: Callable[[Setting], bool] = lambda setting: True
-    time_margin: float = 1.2
     models_by: str | None = None
 
 
@@ -92,6 +92,7 @@ def _sheet_deformation() -> Knobs:
         last=50,
         frames=51,
         size=None,
+        time_margin=1.15,
         settings=(
             *_fidelities(SheetDeformation),
             *(Setting("tolerance", f"{t:g}", replace(default, tolerance=t)) for t in (1e-2, 1e-3, 1e-6)),
@@ -128,6 +129,7 @@ def _deformable_block() -> Knobs:
         last=38,
         frames=39,
         size=None,
+        time_margin=1.37,
         settings=(
             *_fidelities(DeformableBlock),
             Setting("time step", "1 per frame", replace(default, transient_steps=())),
@@ -174,6 +176,7 @@ def _tissue_manipulation() -> Knobs:
         last=100,
         frames=101,
         size=None,
+        time_margin=1.2,
         settings=(
             *_fidelities(TissueManipulation),
             Setting("time step", "half the default's", replace(default, steps=2)),
@@ -222,6 +225,7 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
         frames=contact + 3,
         timed_frames=contact + 16,
         size=SIZE,
+        time_margin=1.08,
         settings=(
             # `fast` is the default's discretisation: nothing faster is sound.
             Setting("fidelity", "default", default),
@@ -238,7 +242,6 @@ def _falling(scene: Any, draws: tuple[int, ...]) -> Knobs:
         full_length=lambda setting: (
             setting.knob != "solver" and setting.level.parts == 1 and setting.level.element != "quadratic"
         ),
-        time_margin=1.08,
         models_by="reference",
     )
 

@@ -41,6 +41,7 @@ SMALL = Knobs(
     last=12,
     frames=13,
     size=None,
+    time_margin=1.2,
     settings=(
         Setting("fidelity", "default", DEFAULT),
         Setting("tolerance", "0.1", replace(DEFAULT, tolerance=1e-1)),
