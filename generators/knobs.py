@@ -48,8 +48,8 @@ class Knobs:
         frames: that a reference needs.
         timed_frames: of settings of which not the whole trajectory is timed; they show what a frame costs.
         size: what distances are divided by [the scene's unit of length]; None: by the displacement.
-        time_margin: times closer than this factor count as equal. It lies in the widest gap, below 1.5, between ratios of
-            times on which the front depends (three studies of each task), so that their noise does not change it.
+        time_margin: times closer than this factor count as equal. It lies in the widest gap, below 1.5, between ratios
+            of times on which the front depends (three studies of each task), so that their noise does not change it.
         settings: all ways to simulate; "fidelity: default" is among them.
         meshes: three levels with fine steps, from coarse to fine; the last is the reference.
         cell_sizes: of their meshes, relative to the first.
