@@ -99,9 +99,9 @@ def advice(study: TradeOff) -> list[str]:
         if not able or budget < (study.convergence.remaining or 0):
             sentences.append(f"within {_percent(budget)} nothing here can be shown to be")
             break
-        fastest = min(w.seconds or 0 for w in able)
+        least = min(w.seconds or 0 for w in able)
         # Of those that count as equally fast, the first.
-        best = next(w for w in able if (w.seconds or 0) <= fastest * study.margin(w))
+        best = next(w for w in able if (w.seconds or 0) <= least * study.margin(w))
         if best is before:
             continue  # it is within this budget, too
         sentences.append(f"if you can afford {_percent(budget)}, use {_name(best)} ({best.seconds:.2g} s)")

@@ -169,7 +169,8 @@ class TradeOff(Record):
         ]
         # Errors over other frames, against another judge, are not to be compared.
         compared = self.models if self.models_by is None else ()
-        margins = [self.margin(way) for way in (*self.simulators, *compared)]
+        ways: tuple[Simulated | Predicted, ...] = (*self.simulators, *compared)
+        margins = [self.margin(way) for way in ways]
         front = pareto_front([*totals, *((m.seconds, m.error) for m in compared)], margins)
         parts = pareto_front(
             [
