@@ -286,11 +286,15 @@ def test_what_is_timed_in_part_is_extrapolated_from_the_least_times() -> None:
     assert bench._least(results, knobs.settings[0], 4) == pytest.approx(2 + 0.2 * 49)
 
 
-def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path: Path) -> None:
+def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Errors are those that follow from trajectories and predictions made here."""
+    monkeypatch.setattr(tradeoff, "EXTRAPOLATED_MARGIN", 1.12)
     judge_setting = Setting("fidelity", "reference", SheetDeformation.fidelities["reference"])
     knobs = replace(
         SMALL,
+        time_margin=1.12,
         last=3,
         frames=4,
         settings=(*SMALL.settings, judge_setting),
@@ -316,7 +320,7 @@ def test_models_are_judged_to_the_end_where_contexts_outlast_the_window(tmp_path
         # Of what was run to the end the default is the faster, and it is more accurate than the model.
         assert predicted.rival == "fidelity: default"
         assert not predicted.on_front
-    assert any(simulated.on_front for simulated in result.simulators)
+    assert result.default.on_front
     better_than_default = result.models[0].model_copy(update={"error": result.models[0].error_of_data / 2})
     rivals = tradeoff.Bench(TASK, scene, knobs).simulators(study.results, better_than_default.context)
     assert [(r.label, r.error == 0) for r in rivals] == [("default", False), ("reference", True)]

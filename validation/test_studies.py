@@ -27,7 +27,7 @@ def test_tradeoff(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
     Other checks run beside this one, so times that differ by less than half count as equal. That alone takes Deformable
     Block off the front by parts: a tolerance of 1e-3 is better solved, and a sixth slower. By total error it stays. For
-    such a comparison half the rounds are enough.
+    such a comparison fewer rounds are enough.
     """
     monkeypatch.setattr(tradeoff, "ROUNDS", 3)
     task, knobs = get_task(name), knobs_of(name)
