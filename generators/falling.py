@@ -7,6 +7,8 @@ Objects the object. Source: paper, sections 5 and C; the original's step, height
 objects are not published, so these are ours.
 """
 
+import platform
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
@@ -52,7 +54,10 @@ MAX_FLIGHT_ERROR = 1e-6  # [m]
 MAX_PENETRATION = 5e-4  # [m]; the explicit solver has none, vertex block descent has springs
 MAX_SPEED_RATIO = 10.0  # of a fall from the highest node; ears and tips whip at up to 4
 
+TOGETHER = 64  # trajectories at once on a GPU, which a single body does not keep busy
+
 Solver = Literal["explicit", "newton-vbd"]
+Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -87,9 +92,15 @@ class FallFidelity:
 
 @dataclass(frozen=True)
 class _FallingObjects(Leveled, SingleTask):
-    """What the two scenes share. Positions in m; the floor is z = 0."""
+    """What the two scenes share. Positions in m; the floor is z = 0.
+
+    Attributes:
+        solver: "explicit", or "newton-vbd" to compare with.
+        device: "cpu", or "cuda" for many trajectories at once. A GPU rounds differently, so its dataset is another one.
+    """
 
     solver: Solver = "explicit"
+    device: Device = "cpu"
 
     name: ClassVar[str]
     tasks: ClassVar[tuple[str, ...]]
@@ -115,6 +126,12 @@ class _FallingObjects(Leveled, SingleTask):
     def __post_init__(self) -> None:
         if self.solver not in get_args(Solver):
             raise GeneratorError(unknown_name("solver", self.solver, list(get_args(Solver))))
+        if self.device not in get_args(Device):
+            raise GeneratorError(unknown_name("device", self.device, list(get_args(Device))))
+        if self.device == "cuda" and self.solver != "explicit":
+            raise GeneratorError(
+                f"on cuda only the solver explicit moves many bodies at once, not {self.solver}"
+            )
         if self.solver == "newton-vbd":
             require_installed("newton", "the solver newton-vbd", "newton")
 
@@ -125,8 +142,15 @@ class _FallingObjects(Leveled, SingleTask):
 
     @property
     def variant(self) -> dict[str, str]:
-        """The solver, where it is not the explicit one."""
-        return {} if self.solver == "explicit" else {"solver": self.solver}
+        """The solver, where it is not the explicit one, and the device, where it is not the CPU."""
+        options: dict[str, str] = {"solver": self.solver, "device": self.device}
+        usual = {"solver": "explicit", "device": "cpu"}
+        return {name: value for name, value in options.items() if value != usual[name]}
+
+    @property
+    def together(self) -> int:
+        """How many trajectories to simulate at once."""
+        return 1 if self.device == "cpu" else TOGETHER
 
     def sample(self, rng: np.random.Generator, index: int) -> FallParameters:
         """Orientation uniform over all rotations, E and nu from the paper's grids, objects in turn."""
@@ -150,22 +174,38 @@ class _FallingObjects(Leveled, SingleTask):
         Raises:
             SolverError: positions are not finite even with steps of an eighth.
             ParameterError: a parameter is out of its physical range, or the floor is not reached in so many frames.
+            GeneratorError: there is no such device.
         """
-        frames = self.frames if frames is None else frames
-        body = self.body(parameters.object)
-        recorded, surface = body.surface_nodes, body.surface
-        body = body.divided(level.parts)
-        orientation = Rotation.from_quat(parameters.orientation)
-        start = orientation.apply(SIZE * body.vertices)
-        start[:, 2] += parameters.height - start[:, 2].min()
+        (outcome,) = self.simulate_together([parameters], level, frames)
+        if isinstance(outcome, SolverError):
+            raise outcome
+        return outcome
 
+    def simulate_together(
+        self, draws: Sequence[FallParameters], level: FallFidelity, frames: int | None = None
+    ) -> list[Trajectory | SolverError]:
+        """The same for several drops from one height: of each its trajectory, or the SolverError."""
+        frames = self.frames if frames is None else frames
+        (height,) = {parameters.height for parameters in draws}
         # Until it touches the floor the body is free of stress, and its motion known.
+        flight = flight_frames(height)
+        if frames <= flight:
+            raise ParameterError(f"frames must be more than the {flight} of the free fall, not {frames}")
+        prepared = [self._solid(parameters, level) for parameters in draws]
+        solids, substeps = [solid for solid, _ in prepared], [steps for _, steps in prepared]
+        landed = land(solids, height, frames, substeps)
+        return [
+            outcome if isinstance(outcome, SolverError) else self._trajectory(parameters, solid, *outcome)
+            for parameters, solid, outcome in zip(draws, solids, landed, strict=True)
+        ]
+
+    def _trajectory(
+        self, parameters: FallParameters, solid: TetrahedralSolid, motion: Motion, substeps: int
+    ) -> Trajectory:
+        body = self.body(parameters.object)
+        recorded, start = body.surface_nodes, solid.vertices[: body.surface_nodes]
         times = _flight_times(parameters.height)
-        if frames <= len(times):
-            raise ParameterError(f"frames must be more than the {len(times)} of the free fall, not {frames}")
-        flight = start[:recorded] + DOWN / 2 * times[:, None, None] ** 2
-        solid, substeps = self._solid(start, body.tetrahedra, parameters, level)
-        motion, substeps = land(solid, parameters.height, frames, substeps)
+        flight = start + DOWN / 2 * times[:, None, None] ** 2
         positions = np.concatenate([flight, motion.positions[1:, :recorded]])
 
         energies, ratios = solid.monitor(motion)
@@ -175,8 +215,8 @@ class _FallingObjects(Leveled, SingleTask):
         return Trajectory(
             positions=positions.astype(np.float32),
             mesh=Mesh(
-                rest_positions=start[:recorded].astype(np.float32),
-                cells=surface.astype(np.int32),
+                rest_positions=start.astype(np.float32),
+                cells=body.surface.astype(np.int32),
                 cell_type=VTK_TRIANGLE,
                 node_type=np.full(recorded, FREE, dtype=np.uint8),
             ),
@@ -259,10 +299,11 @@ class _FallingObjects(Leveled, SingleTask):
             for name in (libraries if self.solver == "explicit" else ("newton", *libraries))
         }
 
-    def _solid(
-        self, start: np.ndarray, tetrahedra: np.ndarray, parameters: FallParameters, level: FallFidelity
-    ) -> "tuple[CapturedSolid, int]":
-        """The body, ready to be moved by the chosen solver, and that solver's substeps per frame."""
+    def _solid(self, parameters: FallParameters, level: FallFidelity) -> "tuple[CapturedSolid, int]":
+        """The body where it starts, ready to be moved by the chosen solver, and that solver's substeps per frame."""
+        body = self.body(parameters.object).divided(level.parts)
+        start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
+        start[:, 2] += parameters.height - start[:, 2].min()
         scene: dict[str, Any] = {
             "density": DENSITY,
             "youngs_modulus": parameters.youngs_modulus,
@@ -275,11 +316,16 @@ class _FallingObjects(Leveled, SingleTask):
         if self.solver == "newton-vbd":
             from m3gn_bench.generators.solvers.vbd import VertexBlockDescent
 
-            body = VertexBlockDescent(start, tetrahedra, iterations=level.vbd_iterations, **scene)
-            return body, level.vbd_substeps
+            descending = VertexBlockDescent(start, body.tetrahedra, iterations=level.vbd_iterations, **scene)
+            return descending, level.vbd_substeps
         from m3gn_bench.generators.solvers.explicit import ExplicitSolid
+        from m3gn_bench.generators.solvers.quiet_warp import wp
 
-        solid = ExplicitSolid(start, tetrahedra, element=level.element, **scene)
+        if self.device == "cuda" and not wp.is_cuda_available():
+            raise GeneratorError(
+                f"{platform.node()} has no CUDA device that Warp can use; simulate on the cpu"
+            )
+        solid = ExplicitSolid(start, body.tetrahedra, element=level.element, device=self.device, **scene)
         return solid, solid.substeps(FRAME_TIME, level.courant)
 
 
@@ -348,41 +394,50 @@ def self_penetrating(positions: np.ndarray, solid: TetrahedralSolid, recorded: i
     return penetrating
 
 
-def land(solid: "CapturedSolid", height: float, frames: int, substeps: int) -> tuple[Motion, int]:
-    """Move a body from the last frame of its free fall on, with smaller steps where the motion diverges.
+def land(
+    solids: "Sequence[CapturedSolid]", height: float, frames: int, substeps: Sequence[int]
+) -> list[tuple[Motion, int] | SolverError]:
+    """Move bodies from the last frame of their free fall on, with smaller steps for those whose motion diverges.
 
     Args:
-        solid: at rest in the pose from which it falls.
-        height: of its lowest point then [m].
+        solids: of one solver, at rest in the pose from which they fall.
+        height: of their lowest points then [m].
         frames: until this one; frame 0 is the start of the fall.
-        substeps: per frame, to begin with.
+        substeps: of each per frame, to begin with.
 
     Returns:
-        The motion from the last frame of the fall on, and the substeps that it took.
-
-    Raises:
-        SolverError: positions are not finite even with steps of an eighth.
+        Of each body the motion from the last frame of the fall on, and the substeps that it took; or the error,
+        where positions are not finite even with steps of an eighth.
     """
     first = flight_frames(height) - 1
     time = FRAME_TIME * first
+    landed: dict[int, tuple[Motion, int] | SolverError] = {}
+    diverging, steps = list(range(len(solids))), list(substeps)
     for halving in range(MAX_HALVINGS + 1):
-        try:
-            motion = solid.run(
-                solid.vertices + DOWN / 2 * time**2,
-                np.tile(DOWN * time, (solid.nodes, 1)),
-                first_frame=first,
-                frames=frames - 1 - first,
-                frame_time=FRAME_TIME,
-                substeps=substeps,
-            )
-        except SolverError:
-            # The step is stable at rest; a cell that is squashed flat may ask for a smaller one.
-            if halving == MAX_HALVINGS:
-                raise
-            substeps *= 2
-        else:
+        moved = [solids[k] for k in diverging]
+        outcomes = type(solids[0]).run_together(
+            moved,
+            [solid.vertices + DOWN / 2 * time**2 for solid in moved],
+            [np.tile(DOWN * time, (solid.nodes, 1)) for solid in moved],
+            first_frame=first,
+            frames=frames - 1 - first,
+            frame_time=FRAME_TIME,
+            substeps=[steps[k] for k in diverging],
+        )
+        # The step is stable at rest; a cell that is squashed flat may ask for a smaller one.
+        again = []
+        for k, outcome in zip(diverging, outcomes, strict=True):
+            if isinstance(outcome, Motion):
+                landed[k] = outcome, steps[k]
+            elif halving == MAX_HALVINGS:
+                landed[k] = outcome
+            else:
+                steps[k] *= 2
+                again.append(k)
+        diverging = again
+        if not diverging:
             break
-    return motion, substeps
+    return [landed[k] for k in range(len(solids))]
 
 
 def flight_frames(height: float) -> int:

@@ -28,7 +28,7 @@ from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, reserved, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.executors import parse_executor
-from m3gn_bench.generators.scene import Scene
+from m3gn_bench.generators.scene import Scene, SimulatesTogether
 from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.provenance import machine
 from m3gn_bench.version import __version__
@@ -66,28 +66,58 @@ def simulate_one(
     Raises:
         GeneratorError: ten draws in a row were rejected.
     """
-    rejected: list[Rejection] = []
+    (made,) = _simulate(scene, split, [index], seed, fidelity)
+    return made
+
+
+def _simulate(
+    scene: Scene, split: Split, indices: Sequence[int], seed: int, fidelity: Fidelity
+) -> list[tuple[Trajectory, list[Rejection]]]:
+    """See `simulate_one`; at once, where the scene can do several."""
+    made: dict[int, Trajectory] = {}
+    rejected: dict[int, list[Rejection]] = {index: [] for index in indices}
     for attempt in range(MAX_ATTEMPTS):
+        missing = [index for index in indices if index not in made]
+        if not missing:
+            break
         start = time.process_time()
+        # One thread: the order of floating-point sums must not depend on the machine's core count.
+        with threadpool_limits(1):
+            draws = [draw(scene, split, index, seed, attempt) for index in missing]
+            outcomes = _outcomes(scene, draws, fidelity)
+        problems = [
+            [str(outcome)] if isinstance(outcome, SolverError) else scene.check(outcome)
+            for outcome in outcomes
+        ]
+        seconds = (time.process_time() - start) / len(missing)
+        for index, outcome, found in zip(missing, outcomes, problems, strict=True):
+            if isinstance(outcome, SolverError) or found:
+                key = trajectory_key(split, index)
+                rejected[index].append(Rejection(key=key, attempt=attempt, reason="; ".join(found)))
+            else:
+                diagnostics = {**outcome.diagnostics, "cpu_seconds": seconds}
+                made[index] = replace(outcome, diagnostics=diagnostics)
+    for index in indices:
+        if index not in made:
+            raise GeneratorError(
+                f"{trajectory_key(split, index)}: all {MAX_ATTEMPTS} draws were rejected, the last because "
+                f"{rejected[index][-1].reason}"
+            )
+    return [(made[index], rejected[index]) for index in indices]
+
+
+def _outcomes(
+    scene: Scene, draws: Sequence[object], fidelity: Fidelity
+) -> Sequence[Trajectory | SolverError]:
+    if isinstance(scene, SimulatesTogether):
+        return scene.simulate_together(draws, scene.fidelities[fidelity])
+    outcomes: list[Trajectory | SolverError] = []
+    for parameters in draws:
         try:
-            # One thread: the order of floating-point sums must not depend on the machine's core count.
-            with threadpool_limits(1):
-                trajectory = scene.simulate(draw(scene, split, index, seed, attempt), fidelity)
-            problems = scene.check(trajectory)
+            outcomes.append(scene.simulate(parameters, fidelity))
         except SolverError as error:
-            problems = [str(error)]
-        else:
-            if not problems:
-                seconds = time.process_time() - start
-                return replace(
-                    trajectory, diagnostics={**trajectory.diagnostics, "cpu_seconds": seconds}
-                ), rejected
-        rejected.append(
-            Rejection(key=trajectory_key(split, index), attempt=attempt, reason="; ".join(problems))
-        )
-    raise GeneratorError(
-        f"{trajectory_key(split, index)}: all {MAX_ATTEMPTS} draws were rejected, the last because {problems[0]}"
-    )
+            outcomes.append(error)
+    return outcomes
 
 
 def dataset_name(scene: Scene, tier: str, splits: Sequence[str], fidelity: str, seed: int) -> str:
@@ -148,7 +178,8 @@ def generate(
         if split in splits
         for i in range(sizes[split])
     }
-    shards = {key: shard_folder / f"{key}.h5" for key in wanted}
+    shards = {key: _shard(shard_folder, key) for key in wanted}
+    together = scene.together if isinstance(scene, SimulatesTogether) else 1
     with reserved(shard_folder, "another process generates this dataset"):
         for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
             left_by_killed_run.unlink()
@@ -157,13 +188,20 @@ def generate(
             todo = [key for key in wanted if not _is_complete(shards[key], [key], metadata)]
             done = len(wanted) - len(todo)
             on_progress(done, len(wanted))
-            # Workers of a cluster start in folders of their own.
-            jobs = ((scene, shards[key].absolute(), key, *wanted[key], metadata) for key in todo)
+            folder = shard_folder.absolute()  # workers of a cluster start in folders of their own
+            missing: dict[Split, list[int]] = {split: [] for split in SPLITS}
+            for split, index in (wanted[key] for key in todo):
+                missing[split].append(index)
+            jobs = (
+                _Job(scene, folder, split, indices[first : first + together], metadata)
+                for split, indices in missing.items()
+                for first in range(0, len(indices), together)
+            )
             with closing(  # so that an exception here ends the workers, too
-                run_jobs(_make_shard, jobs, workers, executor=executor, shared=shard_folder)
+                run_jobs(_make_shards, jobs, workers, executor=executor, shared=shard_folder)
             ) as finished:
-                for _ in finished:
-                    done += 1
+                for made_now in finished:
+                    done += made_now
                     on_progress(done, len(wanted))
             merge_shards(path, shards, metadata, scene.tasks_of)
         with open_file(path) as file:
@@ -216,18 +254,39 @@ def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:
     return found.model_dump(exclude=own) == metadata.model_dump(exclude=own)
 
 
-_Job = tuple[Scene, Path, str, Split, int, Metadata]
+@dataclass(frozen=True)
+class _Job:
+    """Trajectories of a split that one worker makes at once."""
+
+    scene: Scene
+    folder: Path
+    split: Split
+    indices: list[int]
+    metadata: Metadata
 
 
-def _make_shard(job: _Job) -> None:
-    scene, path, key, split, index, metadata = job
-    if _is_complete(path, [key], metadata):  # a worker that died later had come so far
-        return
-    versions = scene.simulator_versions()
+def _make_shards(job: _Job) -> int:
+    """Writes a file for each trajectory; returns how many there are."""
+    metadata = job.metadata
+    shards = {index: _shard(job.folder, trajectory_key(job.split, index)) for index in job.indices}
+    # A worker that died later may have come so far.
+    missing = [
+        index
+        for index, path in shards.items()
+        if not _is_complete(path, [trajectory_key(job.split, index)], metadata)
+    ]
+    versions = job.scene.simulator_versions()
     if versions != metadata.simulator_versions:
         raise GeneratorError(
             f"{platform.node()} would simulate with {versions}, not with {metadata.simulator_versions}; install the "
             "same on all machines"
         )
-    trajectory, rejected = simulate_one(scene, split, index, seed=metadata.seed, fidelity=metadata.fidelity)
-    write_shard(path, key, trajectory, metadata.model_copy(update={"rejections": tuple(rejected)}))
+    made = _simulate(job.scene, job.split, missing, metadata.seed, metadata.fidelity)
+    for index, (trajectory, rejected) in zip(missing, made, strict=True):
+        own = metadata.model_copy(update={"rejections": tuple(rejected)})
+        write_shard(shards[index], trajectory_key(job.split, index), trajectory, own)
+    return len(shards)
+
+
+def _shard(folder: Path, key: str) -> Path:
+    return folder / f"{key}.h5"

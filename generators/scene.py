@@ -1,10 +1,11 @@
 """What a scene is, and which scenes there are."""
 
 import logging
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from inspect import signature
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.plugins import blamed_on_package, load, plugins, usable
 from m3gn_bench.datasets.schema import Fidelity, Split
 from m3gn_bench.datasets.trajectory import Trajectory
-from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.errors import GeneratorError, SolverError
 
 
 class Scene(Protocol):
@@ -71,6 +72,22 @@ class Scene(Protocol):
 
     def simulator_versions(self) -> dict[str, str]:
         """Versions of the libraries whose code shapes the numbers."""
+        ...
+
+
+@runtime_checkable
+class SimulatesTogether(Protocol):
+    """A scene that can simulate several trajectories at once."""
+
+    @property
+    def together(self) -> int:
+        """How many at once are worth while."""
+        ...
+
+    def simulate_together(
+        self, draws: Sequence[Any], level: Any, frames: int | None = None
+    ) -> list[Trajectory | SolverError]:
+        """What `simulate_with` returns or raises for each of these draws."""
         ...
 
 

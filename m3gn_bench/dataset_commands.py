@@ -32,6 +32,11 @@ SHIPPED = "compact"  # preset of the checkpoints that are drawn
     "--solver", default=None, help="Falling teddy, mixed objects: explicit (default) or newton-vbd."
 )
 @click.option(
+    "--device",
+    default=None,
+    help="Falling teddy, mixed objects: cpu (default), or cuda, many at once into a dataset of its own.",
+)
+@click.option(
     "--mesh",
     type=click.Path(path_type=Path, dir_okay=False),
     default=None,
@@ -52,6 +57,7 @@ def generate(
     out: Path | None,
     fidelity: str,
     solver: str | None,
+    device: str | None,
     mesh: Path | None,
     plane: str | None,
     splits: tuple[str, ...],
@@ -69,7 +75,8 @@ def generate(
 
     report = Report(as_json)
     name = TASKS[scene_name].scene if scene_name in TASKS else scene_name
-    options = {key: value for key, value in (("solver", solver), ("plane", plane)) if value is not None}
+    given = {"solver": solver, "device": device, "plane": plane}
+    options = {key: value for key, value in given.items() if value is not None}
     if mesh is None:
         scene = get_scene(name, **options)
     else:

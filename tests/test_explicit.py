@@ -7,10 +7,10 @@ import pytest
 from conftest import box_of_tetrahedra
 from scipy.spatial.transform import Rotation
 
-from m3gn_bench.generators.errors import SolverError
+from m3gn_bench.generators.errors import ParameterError, SolverError
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Element, lame_constants
+from m3gn_bench.generators.solvers.tetrahedra import Element, Motion, lame_constants
 
 MATERIAL = {"density": 1000.0, "youngs_modulus": 2e5, "poisson_ratio": 0.4}
 
@@ -197,14 +197,63 @@ def test_highest_frequency_scales_as_a_wave_does() -> None:
     assert frequency(1.0, 1e6, 4000.0) == pytest.approx(reference / 2, rel=1e-4)
 
 
-@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
-def test_the_same_code_runs_on_cuda() -> None:
-    velocity = np.tile([0.3, 0.0, -3.0], (solid().nodes, 1))
-    on_cpu, on_cuda = (
-        body.run(body.vertices, velocity, frames=20, frame_time=0.01, substeps=40).positions
-        for body in (solid(viscosity=100.0, friction=0.5, device=device) for device in ("cpu", "cuda:0"))
+def several(element: Element, device: str = "cpu") -> list[ExplicitSolid]:
+    """Bodies of different size and material."""
+    changes: list[dict[str, Any]] = [
+        {"youngs_modulus": 1e5},
+        {"cells": 3, "poisson_ratio": 0.49, "density": 800.0},
+        {"cells": 1, "fixed": np.array([0])},
+        {"youngs_modulus": 3e5},
+    ]
+    shared: dict[str, Any] = {"viscosity": 100.0, "friction": 0.5, "element": element, "device": device}
+    return [solid(**shared, **change) for change in changes]
+
+
+def thrown(bodies: list[ExplicitSolid], substeps: list[int]) -> list[Motion | SolverError]:
+    return ExplicitSolid.run_together(
+        bodies,
+        [body.vertices for body in bodies],
+        [np.tile([0.3, 0.1 * k, -3.0], (body.nodes, 1)) for k, body in enumerate(bodies)],
+        frames=20,
+        frame_time=0.01,
+        substeps=substeps,
+        first_frame=6,
     )
-    assert np.abs(on_cpu - on_cuda).max() < 1e-9
+
+
+@pytest.mark.parametrize("element", get_args(Element))
+def test_together_each_moves_as_it_does_alone(element: Element) -> None:
+    """Bit for bit, whatever the others are, however many substeps they take, even if one of them diverges."""
+    bodies, substeps = several(element), [70, 160, 70, 2]
+    for k, (body, steps, together) in enumerate(zip(bodies, substeps, thrown(bodies, substeps), strict=True)):
+        velocity = np.tile([0.3, 0.1 * k, -3.0], (body.nodes, 1))
+        course: dict[str, Any] = {"frames": 20, "frame_time": 0.01, "substeps": steps, "first_frame": 6}
+        if steps == 2:
+            with pytest.raises(SolverError) as alone:
+                body.run(body.vertices, velocity, **course)
+            assert isinstance(together, SolverError)
+            assert str(together) == str(alone.value)
+            continue
+        assert isinstance(together, Motion)
+        expected = body.run(body.vertices, velocity, **course)
+        assert np.array_equal(together.positions, expected.positions)
+        assert np.array_equal(together.velocities, expected.velocities)
+        assert together.lag == expected.lag
+
+
+def test_what_is_one_number_for_all_must_be_the_same() -> None:
+    with pytest.raises(ParameterError, match=r"must have one friction, not \['0.0', '0.5'\]"):
+        thrown([solid(), solid(friction=0.5)], [20, 20])
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("element", get_args(Element))
+def test_the_same_code_runs_on_cuda(element: Element) -> None:
+    motions = [thrown(several(element, device), [70, 160, 70, 80]) for device in ("cpu", "cuda:0")]
+    for on_cpu, on_cuda in zip(*motions, strict=True):
+        assert isinstance(on_cpu, Motion)
+        assert isinstance(on_cuda, Motion)
+        assert np.abs(on_cpu.positions - on_cuda.positions).max() < 1e-9
 
 
 def test_beyond_the_stable_step_the_frame_is_named() -> None:

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -9,9 +10,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from m3gn_bench.datasets.file import open_file, read_trajectory
 from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.datasets.trajectory import Trajectory
-from m3gn_bench.generators.errors import GeneratorError
+from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.falling import (
     FRAME_TIME,
     GRAVITY,
@@ -20,11 +22,13 @@ from m3gn_bench.generators.falling import (
     YOUNGS_MODULI,
     FallFidelity,
     FallingTeddy,
+    FallParameters,
     MixedObjects,
 )
 from m3gn_bench.generators.generate import draw, generate
 from m3gn_bench.generators.objects import load_object, read_object, write_object
 from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.generators.solvers.quiet_warp import wp
 
 TEDDY = FallingTeddy()
 
@@ -100,6 +104,56 @@ def test_a_motion_that_diverges_is_computed_with_smaller_steps() -> None:
     assert np.abs(hasty.positions[:40] - usual.positions[:40]).max() < 2e-3
 
 
+class TogetherOnTheCpu(FallingTeddy):
+    """What a GPU is given, with the arithmetic of the CPU; one draw in four diverges at first."""
+
+    together = 3
+
+    def simulate_together(
+        self, draws: Sequence[FallParameters], level: FallFidelity, frames: int | None = None
+    ) -> list[Trajectory | SolverError]:
+        spoilt = draw(self, "test", 1, DATASET_SEED)
+        made = super().simulate_together(draws, level, frames)
+        return [
+            SolverError("frame 9: it diverges") if parameters == spoilt else outcome
+            for parameters, outcome in zip(draws, made, strict=True)
+        ]
+
+
+def test_a_dataset_of_many_at_once_is_that_of_one_by_one(tmp_path: Path) -> None:
+    done: list[int] = []
+    scene = TogetherOnTheCpu()
+    report = generate(
+        scene, "smoke", tmp_path, splits=["test"], fidelity="fast", on_progress=lambda n, _: done.append(n)
+    )
+    assert done == [0, 3, 4]
+    (rejection,) = report.rejected
+    assert (rejection.key, rejection.attempt, rejection.reason) == ("test_00001", 0, "frame 9: it diverges")
+    with open_file(report.file) as file:
+        for index in range(4):
+            parameters = draw(TEDDY, "test", index, DATASET_SEED, attempt=int(index == 1))
+            expected = TEDDY.simulate(parameters, "fast")
+            assert read_trajectory(file, f"test_{index:05}").content_hash() == expected.content_hash()
+
+
+@pytest.mark.skipif(wp.is_cuda_available(), reason="there is a CUDA device")
+def test_without_a_gpu_cuda_is_refused(tmp_path: Path) -> None:
+    scene = get_scene("falling_teddy", device="cuda")
+    assert scene.variant == {"device": "cuda"}
+    with pytest.raises(GeneratorError, match="has no CUDA device that Warp can use; simulate on the cpu"):
+        generate(scene, "smoke", tmp_path)
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
+def test_a_gpu_simulates_the_same_falls(tmp_path: Path) -> None:
+    """Until the first rebound; later, round-off grows with every contact."""
+    report = generate(get_scene("falling_teddy", device="cuda"), "smoke", tmp_path, splits=["test"])
+    with open_file(report.file) as file:
+        found = read_trajectory(file, "test_00000")
+    expected = TEDDY.simulate(draw(TEDDY, "test", 0, DATASET_SEED))
+    assert np.abs(found.positions[:30] - expected.positions[:30]).max() < 1e-6
+
+
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
@@ -132,6 +186,14 @@ def test_a_users_own_object(tmp_path: Path) -> None:
     assert report.trajectories == 4
 
 
-def test_unknown_solver() -> None:
-    with pytest.raises(GeneratorError, match=r"unknown solver 'magic'; known: explicit, newton-vbd"):
-        get_scene("falling_teddy", solver="magic")
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"solver": "magic"}, "unknown solver 'magic'; known: explicit, newton-vbd"),
+        ({"device": "tpu"}, "unknown device 'tpu'; known: cpu, cuda"),
+        ({"device": "cuda", "solver": "newton-vbd"}, "on cuda only the solver explicit"),
+    ],
+)
+def test_unknown_options(options: dict[str, str], reason: str) -> None:
+    with pytest.raises(GeneratorError, match=reason):
+        get_scene("mixed_objects", **options)

@@ -9,7 +9,6 @@ from typing import NamedTuple
 from unittest.mock import patch
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from sheet_cases import at_recorded_nodes
 from skfem import Basis
 
@@ -22,6 +21,7 @@ from m3gn_bench.generators.deformable_block import (
     BlockParameters,
     DeformableBlock,
 )
+from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.falling import SIZE, FallFidelity, FallParameters, MixedObjects
 from m3gn_bench.generators.sheet_deformation import (
     INCREMENTS,
@@ -444,14 +444,13 @@ def fall(
         pushed_apart: whether to take nodes out of other parts of the body, which self contact would keep out.
     """
     scene = MixedObjects()
-    body = scene.body(parameters.object)
-    recorded = body.surface_nodes
-    body = body.divided(level.parts)
-    start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
-    start[:, 2] += parameters.height - start[:, 2].min()
+    recorded = scene.body(parameters.object).surface_nodes
     with patch.object(falling, "FRICTION", friction), patch.object(falling, "VISCOSITY", viscosity):
-        solid, substeps = scene._solid(start, body.tetrahedra, parameters, level)
-    motion, _ = falling.land(solid, parameters.height, RINGING.stop, substeps)
+        solid, substeps = scene._solid(parameters, level)
+    (outcome,) = falling.land([solid], parameters.height, RINGING.stop, [substeps])
+    if isinstance(outcome, SolverError):
+        raise outcome
+    motion, _ = outcome
     energies, _ = solid.monitor(motion)
     total, first = energies.sum(1), IMPACT - 1
     ringing = range(RINGING.start - first, RINGING.stop - first)

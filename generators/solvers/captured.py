@@ -1,6 +1,7 @@
 """How every solver of falling bodies marches: frame by frame, by replaying a recorded graph of substeps."""
 
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import Self
 
 import numpy as np
 
@@ -10,14 +11,11 @@ from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralS
 
 
 class CapturedSolid(TetrahedralSolid):
-    """A solid on a device of Warp; a solver adds how it begins, what a substep does, and what it needs.
+    """A solid on a device of Warp; a solver adds how several of them move.
 
-    Both solvers know velocities half a substep before positions.
+    All solvers know velocities half a substep before positions.
     """
 
-    captured: ClassVar[
-        int
-    ]  # substeps per recorded graph: long enough to hide the launch, short enough to record
     device: str
 
     def run(
@@ -43,42 +41,102 @@ class CapturedSolid(TetrahedralSolid):
         Raises:
             SolverError: names the first frame whose positions are not finite.
         """
-        substep = frame_time / substeps
-        parts = next(k for k in range(max(1, substeps // self.captured), 0, -1) if substeps % k == 0)
-        path = np.empty((frames + 1, self.nodes, 3))
-        speeds = np.empty_like(path)
-        path[0] = positions
-        speeds[0] = self._earlier(positions, velocities, substep / 2)
-        self._assign(path[0], speeds[0])
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._advance(substeps // parts, substep)
-        for frame in range(1, frames + 1):
-            for _ in range(parts):
-                wp.capture_launch(capture.graph)
-            path[frame], speeds[frame] = self._state()
-            if not np.isfinite(path[frame]).all():
-                raise SolverError(
-                    f"frame {first_frame + frame}: positions are not finite; "
-                    f"{self._effort(substeps)} per frame are too few: use more, or a softer body"
-                )
-        return Motion(path, speeds, lag=substep / 2)
+        (outcome,) = self.run_together(
+            [self],
+            [positions],
+            [velocities],
+            frames=frames,
+            frame_time=frame_time,
+            substeps=[substeps],
+            first_frame=first_frame,
+        )
+        if isinstance(outcome, SolverError):
+            raise outcome
+        return outcome
 
-    def _earlier(self, positions: Array, velocities: Array, lag: float) -> Array:
-        """The velocities [m/s] that this solver begins with: those of a time `lag` [s] earlier."""
+    @classmethod
+    def run_together(
+        cls,
+        solids: Sequence[Self],
+        positions: Sequence[Array],
+        velocities: Sequence[Array],
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: Sequence[int],
+        first_frame: int = 0,
+    ) -> list[Motion | SolverError]:
+        """Move several solids that know nothing of each other: each as `run` does, bit for bit.
+
+        Args:
+            solids, positions, velocities, substeps: one for each solid; see `run`.
+            frames, frame_time, first_frame: the same for all; see `run`.
+
+        Returns:
+            Of each solid its motion, or the error that `run` raises.
+
+        Raises:
+            ParameterError: the solver cannot move these solids together.
+        """
         raise NotImplementedError
 
-    def _assign(self, positions: Array, velocities: Array) -> None:
-        """Put a state on the device."""
-        raise NotImplementedError
-
-    def _advance(self, substeps: int, substep: float) -> None:
-        """Launch so many substeps of `substep` [s]."""
-        raise NotImplementedError
-
-    def _state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities, from the device."""
-        raise NotImplementedError
+    def _lost(self, frame: int, substeps: int) -> SolverError:
+        return SolverError(
+            f"frame {frame}: positions are not finite; "
+            f"{self._effort(substeps)} per frame are too few: use more, or a softer body"
+        )
 
     def _effort(self, substeps: int) -> str:
         """What may be too little, in words."""
         return f"{substeps} substeps"
+
+
+def record(advance: Callable[[int], None], substeps: int, longest: int, device: str) -> Callable[[], None]:
+    """What does so many substeps whenever it is called, without launching each of them again.
+
+    Args:
+        advance: launches as many substeps as it is told.
+        substeps: how many.
+        longest: about how many to record: enough to hide the launch, few enough to record.
+        device: of Warp.
+    """
+    parts = next(k for k in range(max(1, substeps // longest), 0, -1) if substeps % k == 0)
+    with wp.ScopedCapture(device=device) as capture:
+        advance(substeps // parts)
+
+    def play() -> None:
+        for _ in range(parts):
+            wp.capture_launch(capture.graph)
+
+    return play
+
+
+def march(
+    play: Callable[[], None],
+    state: Callable[[], tuple[np.ndarray, np.ndarray]],
+    path: Array,
+    speeds: Array,
+    bodies: Sequence[slice],
+) -> list[int | None]:
+    """Compute frames 1, 2, ... until all are done, or no body is finite any more.
+
+    Args:
+        play: computes a frame.
+        state: positions [m] and velocities [m/s] after it, shape [nodes, 3].
+        path, speeds: written to, shape [frames, nodes, 3].
+        bodies: the nodes of each body.
+
+    Returns:
+        Of each body the first frame whose positions are not finite.
+    """
+    lost: list[int | None] = [None] * len(bodies)
+    for frame in range(1, len(path)):
+        play()
+        path[frame], speeds[frame] = state()
+        finite = np.isfinite(path[frame]).all(1)
+        for body, nodes in enumerate(bodies):
+            if lost[body] is None and not finite[nodes].all():
+                lost[body] = frame
+        if None not in lost:
+            break
+    return lost

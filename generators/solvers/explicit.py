@@ -9,16 +9,19 @@ and Coulomb's law limits the tangential impulse by the same normal one. No penal
 limit on the step.
 
 Time: leapfrog in double precision. Forces are written per tetrahedron and gathered per node, without
-atomics, so the result does not depend on the order of execution. The same code runs on CPU and CUDA.
+atomics, so the result does not depend on the order of execution. The same code runs on CPU and CUDA. Several
+solids can be moved at once, which is what keeps a GPU busy; each moves as it does alone, bit for bit.
 """
 
-from functools import cached_property
-from typing import Any, Unpack
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import Any, Self, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from m3gn_bench.generators.solvers.captured import CapturedSolid
+from m3gn_bench.generators.errors import ParameterError, SolverError
+from m3gn_bench.generators.solvers.captured import CapturedSolid, march, record
 from m3gn_bench.generators.solvers.explicit_kernels import (
     cell_volumes,
     corner_forces,
@@ -28,13 +31,14 @@ from m3gn_bench.generators.solvers.explicit_kernels import (
 )
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import (
-    QUADRATIC_GRADIENTS,
     Array,
     Element,
+    Motion,
     SolidOptions,
 )
 
 MIN_SUBSTEPS = 20  # per frame; resolves the impact of the softest bodies
+RECORDED = 50  # substeps per graph, about
 
 
 class ExplicitSolid(CapturedSolid):
@@ -48,8 +52,6 @@ class ExplicitSolid(CapturedSolid):
         ParameterError: see `TetrahedralSolid`.
     """
 
-    captured = 50
-
     def __init__(
         self,
         vertices: Array,
@@ -61,30 +63,6 @@ class ExplicitSolid(CapturedSolid):
     ) -> None:
         super().__init__(vertices, tetrahedra, element=element, **options)
         self.device = device
-
-        # The cells' nodes, sorted: what a node gathers, always in the same order.
-        flat = self.element_nodes.ravel()
-        incident = np.argsort(flat, kind="stable")
-        start = np.searchsorted(flat[incident], np.arange(self.nodes + 1))
-        if element == "quadratic":
-            self._element_nodes = self._upload(self.element_nodes, wp.int32)
-            self._gradients = self._upload(QUADRATIC_GRADIENTS, wp.vec3d)
-        else:
-            self._tetrahedra = self._upload(self.tetrahedra, wp.vec4i)
-        self._rest = self._upload(self.inverse_edges, wp.mat33d)
-        self._volumes = self._upload(self.volumes, wp.float64)
-        self._nodal_volumes = self._upload(self.nodal_volumes, wp.float64)
-        self._inverse_mass = self._upload(self.inverse_masses, wp.float64)
-        self._incident = self._upload(incident, wp.int32)
-        self._start = self._upload(start, wp.int32)
-        self._cell_volumes = wp.zeros(self.cells, dtype=wp.float64, device=device)
-        self._pressures = wp.zeros(self.nodes, dtype=wp.float64, device=device)
-        self._forces = wp.zeros(self.element_nodes.size, dtype=wp.vec3d, device=device)
-        self._x = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
-        self._v = wp.zeros(self.nodes, dtype=wp.vec3d, device=device)
-
-    def _upload(self, values: np.ndarray, dtype: Any) -> Any:
-        return wp.array(values, dtype=dtype, device=self.device)
 
     # -- the stable step -------------------------------------------------------------------------------
 
@@ -102,46 +80,185 @@ class ExplicitSolid(CapturedSolid):
 
     # -- motion ----------------------------------------------------------------------------------------
 
-    def _earlier(self, positions: Array, velocities: Array, lag: float) -> Array:
-        return velocities - self.accelerations(positions, velocities) * lag
+    def accelerations(self, positions: Array, velocities: Array) -> Array:
+        """By elasticity, viscosity and gravity [m/s^2], shape [nodes, 3]; the floor not counted."""
+        return self._alone.accelerations(positions, velocities)
+
+    @cached_property
+    def _alone(self) -> "_Group":
+        return _Group([self])
+
+    @classmethod
+    def run_together(
+        cls,
+        solids: Sequence[Self],
+        positions: Sequence[Array],
+        velocities: Sequence[Array],
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: Sequence[int],
+        first_frame: int = 0,
+    ) -> list[Motion | SolverError]:
+        """All at once, on the device of the first; see `CapturedSolid`."""
+        # Those with most substeps first: then those that are not done with a frame lie at the front of all arrays.
+        order = sorted(range(len(solids)), key=lambda k: -substeps[k])
+        ordered = [solids[k] for k in order]
+        group = ordered[0]._alone if len(ordered) == 1 else _Group(ordered)
+        lengths = np.array([frame_time / substeps[k] for k in order])
+
+        path = np.empty((frames + 1, group.nodes, 3))
+        speeds = np.empty_like(path)
+        path[0] = np.concatenate([positions[k] for k in order])
+        speeds[0] = np.concatenate([velocities[k] for k in order])
+        lags = np.repeat(lengths / 2, [solid.nodes for solid in ordered])
+        speeds[0] -= group.accelerations(path[0], speeds[0]) * lags[:, None]
+        play = group.record(path[0], speeds[0], lengths, [substeps[k] for k in order])
+        lost = march(play, group.state, path, speeds, group.bodies)
+
+        outcomes: dict[int, Motion | SolverError] = {}
+        for k, nodes, length, frame in zip(order, group.bodies, lengths, lost, strict=True):
+            outcomes[k] = (
+                Motion(path[:, nodes], speeds[:, nodes], lag=float(length) / 2)
+                if frame is None
+                else solids[k]._lost(first_frame + frame, substeps[k])
+            )
+        return [outcomes[k] for k in range(len(solids))]
+
+
+_SHARED = ("element", "viscosity", "friction", "gravity", "floor", "device")
+
+
+class _Group:
+    """Solids side by side in the same arrays of a device: one launch works on all, or on the first few.
+
+    Attributes:
+        bodies: the nodes of each solid.
+
+    Raises:
+        ParameterError: they differ in what is not an array.
+    """
+
+    def __init__(self, solids: "Sequence[ExplicitSolid]") -> None:
+        one = solids[0]
+        for name in _SHARED:
+            values = {getattr(solid, name) for solid in solids}
+            if len(values) > 1:
+                raise ParameterError(
+                    f"solids that move together must have one {name}, not {sorted(map(str, values))}"
+                )
+        self.element, self.viscosity, self.friction = one.element, one.viscosity, one.friction
+        self.gravity, self.floor, self.device = one.gravity, one.floor, one.device
+        nodes, cells = [solid.nodes for solid in solids], [solid.cells for solid in solids]
+        self.nodes_of_first = [0, *np.cumsum(nodes).tolist()]  # so many solids
+        self.cells_of_first = [0, *np.cumsum(cells).tolist()]
+        self.nodes = self.nodes_of_first[-1]
+        self.bodies = [
+            slice(*ends) for ends in zip(self.nodes_of_first, self.nodes_of_first[1:], strict=False)
+        ]
+
+        offset = np.repeat(self.nodes_of_first[:-1], cells)[:, None]
+        self.element_nodes = (np.concatenate([s.element_nodes for s in solids]) + offset).astype(np.int32)
+        self.inverse_masses = np.concatenate([solid.inverse_masses for solid in solids])
+        # The cells' nodes, sorted: what a node gathers, always in the same order.
+        flat = self.element_nodes.ravel()
+        incident = np.argsort(flat, kind="stable")
+        start = np.searchsorted(flat[incident], np.arange(self.nodes + 1))
+        if self.element == "quadratic":
+            self._element_nodes = self._upload(self.element_nodes, wp.int32)
+        else:
+            self._tetrahedra = self._upload(self.element_nodes, wp.vec4i)
+        mu, lam = np.array([solid.mu for solid in solids]), np.array([solid.lam for solid in solids])
+        self._mu = self._upload(np.repeat(mu, cells), wp.float64)
+        self._lam = self._upload(np.repeat(lam, cells), wp.float64)
+        self._nodal_lam = self._upload(np.repeat(lam, nodes), wp.float64)
+        self._rest = self._upload(np.concatenate([solid.inverse_edges for solid in solids]), wp.mat33d)
+        self._volumes = self._upload(np.concatenate([solid.volumes for solid in solids]), wp.float64)
+        nodal_volumes = np.concatenate([solid.nodal_volumes for solid in solids])
+        self._nodal_volumes = self._upload(nodal_volumes, wp.float64)
+        self._inverse_mass = self._upload(self.inverse_masses, wp.float64)
+        self._incident = self._upload(incident, wp.int32)
+        self._start = self._upload(start, wp.int32)
+        self._cell_volumes = self._zeros(len(self.element_nodes), wp.float64)
+        self._pressures = self._zeros(self.nodes, wp.float64)
+        self._forces = self._zeros(flat.size, wp.vec3d)
+        self._substeps = self._zeros(self.nodes, wp.float64)
+        self._x = self._zeros(self.nodes, wp.vec3d)
+        self._v = self._zeros(self.nodes, wp.vec3d)
+
+    def _upload(self, values: np.ndarray, dtype: Any) -> Any:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+    def _zeros(self, size: int, dtype: Any) -> Any:
+        return wp.zeros(size, dtype=dtype, device=self.device)
+
+    def accelerations(self, positions: Array, velocities: Array) -> Array:
+        """See `ExplicitSolid`; of all nodes."""
+        self._assign(positions, velocities)
+        self._launch_forces(len(self.bodies))
+        corners = self.element_nodes.ravel()
+        by_axis = [np.bincount(corners, force, self.nodes) for force in self._forces.numpy().T]
+        gravity = np.where(self.inverse_masses > 0, -self.gravity, 0.0)
+        return np.stack(by_axis, axis=1) * self.inverse_masses[:, None] + gravity[:, None] * np.array(
+            [0.0, 0.0, 1.0]
+        )
+
+    def record(
+        self, positions: Array, velocities: Array, lengths: Array, substeps: Sequence[int]
+    ) -> Callable[[], None]:
+        """Put the solids into a state [m, m/s], and get what moves them on by a frame.
+
+        Args:
+            positions, velocities: of all nodes.
+            lengths: of each solid's substeps [s].
+            substeps: of each solid per frame, in descending order.
+        """
+        self._assign(positions, velocities)
+        self._substeps.assign(np.repeat(lengths, np.diff(self.nodes_of_first)))
+        plays, done = [], 0
+        for moving in range(len(self.bodies), 0, -1):
+            more = substeps[moving - 1] - done
+            if more:
+                plays.append(record(partial(self._advance, moving), more, RECORDED, self.device))
+                done += more
+
+        def play() -> None:
+            for part in plays:
+                part()
+
+        return play
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and velocities [m/s], from the device."""
+        return self._x.numpy(), self._v.numpy()
 
     def _assign(self, positions: Array, velocities: Array) -> None:
         self._x.assign(np.ascontiguousarray(positions, dtype=np.float64))
         self._v.assign(np.ascontiguousarray(velocities, dtype=np.float64))
 
-    def _state(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._x.numpy(), self._v.numpy()
+    def _advance(self, moving: int, substeps: int) -> None:
+        """Launch so many substeps of the first solids."""
+        gather = [self._forces, self._start, self._incident, self._inverse_mass]
+        world = [self.gravity, self.friction, self.floor, self._substeps]
+        for _ in range(substeps):
+            self._launch_forces(moving)
+            self._launch(move, self.nodes_of_first[moving], *gather, *world, self._x, self._v)
 
-    def accelerations(self, positions: Array, velocities: Array) -> Array:
-        """By elasticity, viscosity and gravity [m/s^2], shape [nodes, 3]; the floor not counted."""
-        self._assign(positions, velocities)
-        self._launch_forces()
-        by_corner = self._forces.numpy()
-        forces = np.stack([self.gather(by_corner[:, axis]) for axis in range(3)], axis=1)
-        gravity = np.where(self.inverse_masses > 0, -self.gravity, 0.0)
-        return forces * self.inverse_masses[:, None] + gravity[:, None] * np.array([0.0, 0.0, 1.0])
-
-    def _launch_forces(self) -> None:
-        law = [self.mu, self.lam, self.viscosity]
+    def _launch_forces(self, moving: int) -> None:
+        nodes, cells = self.nodes_of_first[moving], self.cells_of_first[moving]
+        law = [self._mu, self._lam, self.viscosity]
         if self.element == "quadratic":
-            body = [self._element_nodes, self._gradients, self._rest, self._volumes]
-            self._launch(quadratic_forces, self.cells, self._x, self._v, *body, *law, self._forces)
+            body = [self._element_nodes, self._rest, self._volumes]
+            self._launch(quadratic_forces, cells, self._x, self._v, *body, *law, self._forces)
             return
         body = [self._tetrahedra, self._rest, self._volumes]
         nodal_pressure = self.element == "nodal pressure"
         if nodal_pressure:
-            self._launch(cell_volumes, self.cells, self._x, *body, self._cell_volumes)
-            gather = [self._start, self._incident, self._nodal_volumes]
-            self._launch(nodal_pressures, self.nodes, self._cell_volumes, *gather, self.lam, self._pressures)
+            self._launch(cell_volumes, cells, self._x, *body, self._cell_volumes)
+            gather = [self._start, self._incident, self._nodal_volumes, self._nodal_lam]
+            self._launch(nodal_pressures, nodes, self._cell_volumes, *gather, self._pressures)
         body += [self._pressures, *law, nodal_pressure]
-        self._launch(corner_forces, self.cells, self._x, self._v, *body, self._forces)
-
-    def _advance(self, substeps: int, substep: float) -> None:
-        gather = [self._forces, self._start, self._incident, self._inverse_mass]
-        world = [self.gravity, self.friction, self.floor, substep]
-        for _ in range(substeps):
-            self._launch_forces()
-            self._launch(move, self.nodes, *gather, *world, self._x, self._v)
+        self._launch(corner_forces, cells, self._x, self._v, *body, self._forces)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object) -> None:
         wp.launch(kernel, dim=size, inputs=list(inputs), device=self.device)

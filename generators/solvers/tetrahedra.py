@@ -30,12 +30,12 @@ Array = NDArray[np.float64]
 Element = Literal["linear", "nodal pressure", "quadratic"]
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # corners of a tetrahedron's edges
-_NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric coordinates of Gauss points
+NEAR, FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric coordinates of Gauss points
 
 
 def _quadratic_gradients() -> Array:
     """Gradients of the ten shape functions at the four Gauss points of the unit tetrahedron, shape [4, 10, 3]."""
-    weights = np.where(np.eye(4, dtype=bool), _NEAR, _FAR)[:, :, None]  # [point, corner, 1]
+    weights = np.where(np.eye(4, dtype=bool), NEAR, FAR)[:, :, None]  # [point, corner, 1]
     slopes = np.concatenate([-np.ones((1, 3)), np.eye(3)])  # of the barycentric coordinates
     first, second = EDGES.T
     corners = (4 * weights - 1) * slopes

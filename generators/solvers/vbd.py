@@ -37,21 +37,24 @@ gain energy in the impact (more than 1 % of it within a frame), the third does n
 """
 
 import logging
+from collections.abc import Sequence
+from functools import partial
 from types import ModuleType
-from typing import Unpack
+from typing import Self, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from m3gn_bench.generators.errors import require_installed
-from m3gn_bench.generators.solvers.captured import CapturedSolid
+from m3gn_bench.generators.errors import SolverError, require_installed
+from m3gn_bench.generators.solvers.captured import CapturedSolid, march, record
 from m3gn_bench.generators.solvers.quiet_warp import wp
-from m3gn_bench.generators.solvers.tetrahedra import Array, SolidOptions
+from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions
 from m3gn_bench.generators.solvers.vbd_kernels import set_velocities
 
 FLOOR_STIFFNESS = 1e7  # [N/m] per node; a node that carries 500 N sinks 0.05 mm into the skin
 FLOOR_SKIN = 2e-4  # [m], the height at which the springs begin
 FRICTION_SPEED = 1e-2  # [m/s], slower sliding is resisted less than Coulomb's law says
+RECORDED = 10  # substeps per graph, about
 ANYWHERE = 1e6  # [m], so far from the floor a node's contact is known beforehand
 
 
@@ -69,8 +72,6 @@ class VertexBlockDescent(CapturedSolid):
         GeneratorError: Newton is not installed.
         ValueError: a parameter out of its physical range, or a tetrahedron without volume.
     """
-
-    captured = 10
 
     def __init__(
         self,
@@ -130,15 +131,47 @@ class VertexBlockDescent(CapturedSolid):
             self._contacts = pipeline.contacts()
             pipeline.collide(self._states[0], self._contacts)
 
-    def _earlier(self, positions: Array, velocities: Array, lag: float) -> Array:
-        # With half a step of gravity taken back, free fall is exact.
-        earlier = np.where(self._free[:, None], velocities, 0.0)
-        earlier[self._free, 2] += self.gravity * lag
-        return earlier
+    @classmethod
+    def run_together(
+        cls,
+        solids: Sequence[Self],
+        positions: Sequence[Array],
+        velocities: Sequence[Array],
+        *,
+        frames: int,
+        frame_time: float,
+        substeps: Sequence[int],
+        first_frame: int = 0,
+    ) -> list[Motion | SolverError]:
+        """One after the other; see `CapturedSolid`."""
+        return [
+            solid._run(x, v, frames, frame_time, steps, first_frame)
+            for solid, x, v, steps in zip(solids, positions, velocities, substeps, strict=True)
+        ]
 
-    def _assign(self, positions: Array, velocities: Array) -> None:
-        self._states[0].particle_q.assign(positions.astype(np.float32))
-        self._states[0].particle_qd.assign(velocities.astype(np.float32))
+    def _run(
+        self,
+        positions: Array,
+        velocities: Array,
+        frames: int,
+        frame_time: float,
+        substeps: int,
+        first_frame: int,
+    ) -> Motion | SolverError:
+        substep = frame_time / substeps
+        path = np.empty((frames + 1, self.nodes, 3))
+        speeds = np.empty_like(path)
+        path[0] = positions
+        # With half a step of gravity taken back, free fall is exact.
+        speeds[0] = np.where(self._free[:, None], velocities, 0.0)
+        speeds[0, self._free, 2] += self.gravity * substep / 2
+        self._states[0].particle_q.assign(path[0].astype(np.float32))
+        self._states[0].particle_qd.assign(speeds[0].astype(np.float32))
+        play = record(partial(self._advance, substep), substeps, RECORDED, self.device)
+        (lost,) = march(play, self._state, path, speeds, [slice(None)])
+        if lost is not None:
+            return self._lost(first_frame + lost, substeps)
+        return Motion(path, speeds, lag=substep / 2)
 
     def _state(self) -> tuple[np.ndarray, np.ndarray]:
         return self._states[0].particle_q.numpy(), self._states[0].particle_qd.numpy()
@@ -146,7 +179,7 @@ class VertexBlockDescent(CapturedSolid):
     def _effort(self, substeps: int) -> str:
         return f"{self.iterations} iterations in {substeps} substeps"
 
-    def _advance(self, substeps: int, substep: float) -> None:
+    def _advance(self, substep: float, substeps: int) -> None:
         now, then = self._states
         for _ in range(substeps):
             self._solver.step(now, then, self._control, self._contacts, substep)
