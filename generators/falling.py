@@ -186,23 +186,32 @@ class _FallingObjects(Leveled, SingleTask):
     ) -> list[Trajectory | SolverError]:
         """The same for several drops from one height: of each its trajectory, or the SolverError."""
         frames = self.frames if frames is None else frames
-        (height,) = {parameters.height for parameters in draws}
+        height, *others = {parameters.height for parameters in draws}
+        if others:
+            raise ParameterError("bodies that are simulated together must fall from one height")
         # Until it touches the floor the body is free of stress, and its motion known.
         flight = flight_frames(height)
         if frames <= flight:
             raise ParameterError(f"frames must be more than the {flight} of the free fall, not {frames}")
-        prepared = [self._solid(parameters, level) for parameters in draws]
-        solids, substeps = [solid for solid, _ in prepared], [steps for _, steps in prepared]
+        bodies = [self.body(parameters.object) for parameters in draws]
+        prepared = [self._solid(b, p, level) for b, p in zip(bodies, draws, strict=True)]
+        solids, substeps = zip(*prepared, strict=True)
         landed = land(solids, height, frames, substeps)
         return [
-            outcome if isinstance(outcome, SolverError) else self._trajectory(parameters, solid, *outcome)
-            for parameters, solid, outcome in zip(draws, solids, landed, strict=True)
+            outcome
+            if isinstance(outcome, SolverError)
+            else self._trajectory(body, parameters, solid, *outcome)
+            for body, parameters, solid, outcome in zip(bodies, draws, solids, landed, strict=True)
         ]
 
     def _trajectory(
-        self, parameters: FallParameters, solid: TetrahedralSolid, motion: Motion, substeps: int
+        self,
+        body: SoftBody,
+        parameters: FallParameters,
+        solid: TetrahedralSolid,
+        motion: Motion,
+        substeps: int,
     ) -> Trajectory:
-        body = self.body(parameters.object)
         recorded, start = body.surface_nodes, solid.vertices[: body.surface_nodes]
         times = _flight_times(parameters.height)
         flight = start + DOWN / 2 * times[:, None, None] ** 2
@@ -299,9 +308,11 @@ class _FallingObjects(Leveled, SingleTask):
             for name in (libraries if self.solver == "explicit" else ("newton", *libraries))
         }
 
-    def _solid(self, parameters: FallParameters, level: FallFidelity) -> "tuple[CapturedSolid, int]":
+    def _solid(
+        self, body: SoftBody, parameters: FallParameters, level: FallFidelity
+    ) -> "tuple[CapturedSolid, int]":
         """The body where it starts, ready to be moved by the chosen solver, and that solver's substeps per frame."""
-        body = self.body(parameters.object).divided(level.parts)
+        body = body.divided(level.parts)
         start = Rotation.from_quat(parameters.orientation).apply(SIZE * body.vertices)
         start[:, 2] += parameters.height - start[:, 2].min()
         scene: dict[str, Any] = {
@@ -409,33 +420,30 @@ def land(
         Of each body the motion from the last frame of the fall on, and the substeps that it took; or the error,
         where positions are not finite even with steps of an eighth.
     """
+    # Imported here: it loads Warp.
+    from m3gn_bench.generators.solvers.captured import Course, Start
+
     first = flight_frames(height) - 1
     time = FRAME_TIME * first
+    course = Course(frames - 1 - first, FRAME_TIME, first)
     landed: dict[int, tuple[Motion, int] | SolverError] = {}
-    diverging, steps = list(range(len(solids))), list(substeps)
-    for halving in range(MAX_HALVINGS + 1):
-        moved = [solids[k] for k in diverging]
-        outcomes = type(solids[0]).run_together(
-            moved,
-            [solid.vertices + DOWN / 2 * time**2 for solid in moved],
-            [np.tile(DOWN * time, (solid.nodes, 1)) for solid in moved],
-            first_frame=first,
-            frames=frames - 1 - first,
-            frame_time=FRAME_TIME,
-            substeps=[steps[k] for k in diverging],
-        )
+    left = dict(enumerate(substeps))
+    for _ in range(MAX_HALVINGS + 1):
+        moved = [solids[k] for k in left]
+        starts = [
+            Start(
+                solid.vertices + DOWN / 2 * time**2,
+                np.tile(DOWN * time, (solid.nodes, 1)),
+                steps,
+            )
+            for solid, steps in zip(moved, left.values(), strict=True)
+        ]
+        outcomes = type(solids[0]).run_together(moved, starts, course)
+        for (k, steps), outcome in zip(left.items(), outcomes, strict=True):
+            landed[k] = outcome if isinstance(outcome, SolverError) else (outcome, steps)
         # The step is stable at rest; a cell that is squashed flat may ask for a smaller one.
-        again = []
-        for k, outcome in zip(diverging, outcomes, strict=True):
-            if isinstance(outcome, Motion):
-                landed[k] = outcome, steps[k]
-            elif halving == MAX_HALVINGS:
-                landed[k] = outcome
-            else:
-                steps[k] *= 2
-                again.append(k)
-        diverging = again
-        if not diverging:
+        left = {k: 2 * steps for k, steps in left.items() if isinstance(landed[k], SolverError)}
+        if not left:
             break
     return [landed[k] for k in range(len(solids))]
 

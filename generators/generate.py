@@ -268,12 +268,10 @@ class _Job:
 def _make_shards(job: _Job) -> int:
     """Writes a file for each trajectory; returns how many there are."""
     metadata = job.metadata
-    shards = {index: _shard(job.folder, trajectory_key(job.split, index)) for index in job.indices}
+    keys = {index: trajectory_key(job.split, index) for index in job.indices}
     # A worker that died later may have come so far.
     missing = [
-        index
-        for index, path in shards.items()
-        if not _is_complete(path, [trajectory_key(job.split, index)], metadata)
+        index for index, key in keys.items() if not _is_complete(_shard(job.folder, key), [key], metadata)
     ]
     versions = job.scene.simulator_versions()
     if versions != metadata.simulator_versions:
@@ -284,8 +282,8 @@ def _make_shards(job: _Job) -> int:
     made = _simulate(job.scene, job.split, missing, metadata.seed, metadata.fidelity)
     for index, (trajectory, rejected) in zip(missing, made, strict=True):
         own = metadata.model_copy(update={"rejections": tuple(rejected)})
-        write_shard(shards[index], trajectory_key(job.split, index), trajectory, own)
-    return len(shards)
+        write_shard(_shard(job.folder, keys[index]), keys[index], trajectory, own)
+    return len(keys)
 
 
 def _shard(folder: Path, key: str) -> Path:

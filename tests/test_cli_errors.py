@@ -69,7 +69,10 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         (["generate", TASK, "--solver", "explicit"], [f"{TASK} has no options", "'solver'"]),
         (["generate", "falling_teddy", "--solver", "x"], ["solver 'x'", "known: explicit, newton-vbd"]),
         (["generate", "falling_teddy", "--device", "x"], ["device 'x'", "known: cpu, cuda"]),
-        (["generate", "mixed_objects", "--mesh", "x.stl"], ["of mixed_objects 'mesh'", "known: device, solver"]),
+        (
+            ["generate", "mixed_objects", "--mesh", "x.stl"],
+            ["of mixed_objects 'mesh'", "known: device, solver"],
+        ),
         (["generate", "falling_teddy", "--mesh", "absent.stl"], ["absent.stl", "no such file"]),
         (["generate", "deformable_block", "--plane", "flat"], ["plane 'flat'", "known: strain, stress"]),
         (["reproduce", "bending"], ["scene 'bending'", "known: deformable_block, falling_teddy,"]),

@@ -8,6 +8,7 @@ from conftest import box_of_tetrahedra
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.generators.errors import ParameterError, SolverError
+from m3gn_bench.generators.solvers.captured import Course, Start
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import Element, Motion, lame_constants
@@ -210,15 +211,11 @@ def several(element: Element, device: str = "cpu") -> list[ExplicitSolid]:
 
 
 def thrown(bodies: list[ExplicitSolid], substeps: list[int]) -> list[Motion | SolverError]:
-    return ExplicitSolid.run_together(
-        bodies,
-        [body.vertices for body in bodies],
-        [np.tile([0.3, 0.1 * k, -3.0], (body.nodes, 1)) for k, body in enumerate(bodies)],
-        frames=20,
-        frame_time=0.01,
-        substeps=substeps,
-        first_frame=6,
-    )
+    starts = [
+        Start(body.vertices, np.tile([0.3, 0.1 * k, -3.0], (body.nodes, 1)), steps)
+        for k, (body, steps) in enumerate(zip(bodies, substeps, strict=True))
+    ]
+    return ExplicitSolid.run_together(bodies, starts, Course(frames=20, frame_time=0.01, first_frame=6))
 
 
 @pytest.mark.parametrize("element", get_args(Element))

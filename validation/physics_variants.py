@@ -444,9 +444,10 @@ def fall(
         pushed_apart: whether to take nodes out of other parts of the body, which self contact would keep out.
     """
     scene = MixedObjects()
-    recorded = scene.body(parameters.object).surface_nodes
+    body = scene.body(parameters.object)
+    recorded = body.surface_nodes
     with patch.object(falling, "FRICTION", friction), patch.object(falling, "VISCOSITY", viscosity):
-        solid, substeps = scene._solid(parameters, level)
+        solid, substeps = scene._solid(body, parameters, level)
     (outcome,) = falling.land([solid], parameters.height, RINGING.stop, [substeps])
     if isinstance(outcome, SolverError):
         raise outcome

@@ -1,6 +1,7 @@
 """How every solver of falling bodies marches: frame by frame, by replaying a recorded graph of substeps."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -8,6 +9,24 @@ import numpy as np
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, TetrahedralSolid
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a solid moves on from, and with how many substeps of the solver per frame; see `CapturedSolid.run`."""
+
+    positions: Array
+    velocities: Array
+    substeps: int
+
+
+@dataclass(frozen=True)
+class Course:
+    """For how long solids move; see `CapturedSolid.run`."""
+
+    frames: int
+    frame_time: float
+    first_frame: int = 0
 
 
 class CapturedSolid(TetrahedralSolid):
@@ -41,36 +60,17 @@ class CapturedSolid(TetrahedralSolid):
         Raises:
             SolverError: names the first frame whose positions are not finite.
         """
-        (outcome,) = self.run_together(
-            [self],
-            [positions],
-            [velocities],
-            frames=frames,
-            frame_time=frame_time,
-            substeps=[substeps],
-            first_frame=first_frame,
-        )
+        start, course = Start(positions, velocities, substeps), Course(frames, frame_time, first_frame)
+        (outcome,) = self.run_together([self], [start], course)
         if isinstance(outcome, SolverError):
             raise outcome
         return outcome
 
     @classmethod
     def run_together(
-        cls,
-        solids: Sequence[Self],
-        positions: Sequence[Array],
-        velocities: Sequence[Array],
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: Sequence[int],
-        first_frame: int = 0,
+        cls, solids: Sequence[Self], starts: Sequence[Start], course: Course
     ) -> list[Motion | SolverError]:
         """Move several solids that know nothing of each other: each as `run` does, bit for bit.
-
-        Args:
-            solids, positions, velocities, substeps: one for each solid; see `run`.
-            frames, frame_time, first_frame: the same for all; see `run`.
 
         Returns:
             Of each solid its motion, or the error that `run` raises.
@@ -114,23 +114,29 @@ def record(advance: Callable[[int], None], substeps: int, longest: int, device: 
 def march(
     play: Callable[[], None],
     state: Callable[[], tuple[np.ndarray, np.ndarray]],
-    path: Array,
-    speeds: Array,
+    positions: Array,
+    velocities: Array,
+    frames: int,
     bodies: Sequence[slice],
-) -> list[int | None]:
+) -> tuple[Array, Array, list[int | None]]:
     """Compute frames 1, 2, ... until all are done, or no body is finite any more.
 
     Args:
         play: computes a frame.
         state: positions [m] and velocities [m/s] after it, shape [nodes, 3].
-        path, speeds: written to, shape [frames, nodes, 3].
+        positions, velocities: the same in frame 0.
+        frames: how many to compute.
         bodies: the nodes of each body.
 
     Returns:
-        Of each body the first frame whose positions are not finite.
+        Positions and velocities, shape [frames + 1, nodes, 3], and of each body the first frame whose positions are
+        not finite.
     """
+    path = np.empty((frames + 1, *positions.shape))
+    speeds = np.empty_like(path)
+    path[0], speeds[0] = positions, velocities
     lost: list[int | None] = [None] * len(bodies)
-    for frame in range(1, len(path)):
+    for frame in range(1, frames + 1):
         play()
         path[frame], speeds[frame] = state()
         finite = np.isfinite(path[frame]).all(1)
@@ -139,4 +145,4 @@ def march(
                 lost[body] = frame
         if None not in lost:
             break
-    return lost
+    return path, speeds, lost

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from m3gn_bench.generators.errors import ParameterError, SolverError
-from m3gn_bench.generators.solvers.captured import CapturedSolid, march, record
+from m3gn_bench.generators.solvers.captured import CapturedSolid, Course, Start, march, record
 from m3gn_bench.generators.solvers.explicit_kernels import (
     cell_volumes,
     corner_forces,
@@ -90,38 +90,28 @@ class ExplicitSolid(CapturedSolid):
 
     @classmethod
     def run_together(
-        cls,
-        solids: Sequence[Self],
-        positions: Sequence[Array],
-        velocities: Sequence[Array],
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: Sequence[int],
-        first_frame: int = 0,
+        cls, solids: Sequence[Self], starts: Sequence[Start], course: Course
     ) -> list[Motion | SolverError]:
         """All at once, on the device of the first; see `CapturedSolid`."""
         # Those with most substeps first: then those that are not done with a frame lie at the front of all arrays.
-        order = sorted(range(len(solids)), key=lambda k: -substeps[k])
-        ordered = [solids[k] for k in order]
+        order = sorted(range(len(solids)), key=lambda k: -starts[k].substeps)
+        ordered, begun = [solids[k] for k in order], [starts[k] for k in order]
         group = ordered[0]._alone if len(ordered) == 1 else _Group(ordered)
-        lengths = np.array([frame_time / substeps[k] for k in order])
-
-        path = np.empty((frames + 1, group.nodes, 3))
-        speeds = np.empty_like(path)
-        path[0] = np.concatenate([positions[k] for k in order])
-        speeds[0] = np.concatenate([velocities[k] for k in order])
+        substeps = [start.substeps for start in begun]
+        lengths = course.frame_time / np.array(substeps)
+        positions = np.concatenate([start.positions for start in begun])
+        velocities = np.concatenate([start.velocities for start in begun])
         lags = np.repeat(lengths / 2, [solid.nodes for solid in ordered])
-        speeds[0] -= group.accelerations(path[0], speeds[0]) * lags[:, None]
-        play = group.record(path[0], speeds[0], lengths, [substeps[k] for k in order])
-        lost = march(play, group.state, path, speeds, group.bodies)
+        earlier = velocities - group.accelerations(positions, velocities) * lags[:, None]
+        play = group.record(positions, earlier, lengths, substeps)
+        path, speeds, lost = march(play, group.state, positions, earlier, course.frames, group.bodies)
 
         outcomes: dict[int, Motion | SolverError] = {}
         for k, nodes, length, frame in zip(order, group.bodies, lengths, lost, strict=True):
             outcomes[k] = (
                 Motion(path[:, nodes], speeds[:, nodes], lag=float(length) / 2)
                 if frame is None
-                else solids[k]._lost(first_frame + frame, substeps[k])
+                else solids[k]._lost(course.first_frame + frame, starts[k].substeps)
             )
         return [outcomes[k] for k in range(len(solids))]
 
@@ -140,13 +130,13 @@ class _Group:
     """
 
     def __init__(self, solids: "Sequence[ExplicitSolid]") -> None:
-        one = solids[0]
         for name in _SHARED:
             values = {getattr(solid, name) for solid in solids}
             if len(values) > 1:
                 raise ParameterError(
                     f"solids that move together must have one {name}, not {sorted(map(str, values))}"
                 )
+        one = solids[0]  # not kept: it may keep this group
         self.element, self.viscosity, self.friction = one.element, one.viscosity, one.friction
         self.gravity, self.floor, self.device = one.gravity, one.floor, one.device
         nodes, cells = [solid.nodes for solid in solids], [solid.cells for solid in solids]

@@ -46,7 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from m3gn_bench.generators.errors import SolverError, require_installed
-from m3gn_bench.generators.solvers.captured import CapturedSolid, march, record
+from m3gn_bench.generators.solvers.captured import CapturedSolid, Course, Start, march, record
 from m3gn_bench.generators.solvers.quiet_warp import wp
 from m3gn_bench.generators.solvers.tetrahedra import Array, Motion, SolidOptions
 from m3gn_bench.generators.solvers.vbd_kernels import set_velocities
@@ -133,44 +133,23 @@ class VertexBlockDescent(CapturedSolid):
 
     @classmethod
     def run_together(
-        cls,
-        solids: Sequence[Self],
-        positions: Sequence[Array],
-        velocities: Sequence[Array],
-        *,
-        frames: int,
-        frame_time: float,
-        substeps: Sequence[int],
-        first_frame: int = 0,
+        cls, solids: Sequence[Self], starts: Sequence[Start], course: Course
     ) -> list[Motion | SolverError]:
         """One after the other; see `CapturedSolid`."""
-        return [
-            solid._run(x, v, frames, frame_time, steps, first_frame)
-            for solid, x, v, steps in zip(solids, positions, velocities, substeps, strict=True)
-        ]
+        return [solid._run(start, course) for solid, start in zip(solids, starts, strict=True)]
 
-    def _run(
-        self,
-        positions: Array,
-        velocities: Array,
-        frames: int,
-        frame_time: float,
-        substeps: int,
-        first_frame: int,
-    ) -> Motion | SolverError:
-        substep = frame_time / substeps
-        path = np.empty((frames + 1, self.nodes, 3))
-        speeds = np.empty_like(path)
-        path[0] = positions
+    def _run(self, start: Start, course: Course) -> Motion | SolverError:
+        substep = course.frame_time / start.substeps
         # With half a step of gravity taken back, free fall is exact.
-        speeds[0] = np.where(self._free[:, None], velocities, 0.0)
-        speeds[0, self._free, 2] += self.gravity * substep / 2
-        self._states[0].particle_q.assign(path[0].astype(np.float32))
-        self._states[0].particle_qd.assign(speeds[0].astype(np.float32))
-        play = record(partial(self._advance, substep), substeps, RECORDED, self.device)
-        (lost,) = march(play, self._state, path, speeds, [slice(None)])
+        earlier = np.where(self._free[:, None], start.velocities, 0.0)
+        earlier[self._free, 2] += self.gravity * substep / 2
+        self._states[0].particle_q.assign(start.positions.astype(np.float32))
+        self._states[0].particle_qd.assign(earlier.astype(np.float32))
+        play = record(partial(self._advance, substep), start.substeps, RECORDED, self.device)
+        bodies = [slice(None)]
+        path, speeds, (lost,) = march(play, self._state, start.positions, earlier, course.frames, bodies)
         if lost is not None:
-            return self._lost(first_frame + lost, substeps)
+            return self._lost(course.first_frame + lost, start.substeps)
         return Motion(path, speeds, lag=substep / 2)
 
     def _state(self) -> tuple[np.ndarray, np.ndarray]:
