@@ -7,10 +7,11 @@ whose worker dies is run again, a few times; whatever it had finished it finds.
 import logging
 import platform
 import shutil
+import subprocess
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic
@@ -22,19 +23,20 @@ from m3gn_bench.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client
+    from submitit import Job as SubmititJob
 
 CONNECT_SECONDS = 4  # to a scheduler
 LOOK_SECONDS = 10.0  # between looks at workers that give no results
 GONE = "the dask scheduler at {} went away; run the same command again to go on"
 
-SLURM_CLUSTER = "slurm"  # submitit's name of it
 PARTS_PER_WORKER = 4  # of all jobs: more even out, fewer start Python less often
 LARGEST_ARRAY = 1000  # jobs at once that SLURM takes where nobody changed MaxArraySize
 SLURM_MINUTES = (
     240  # before SLURM stops a job and it is queued again; SBATCH_TIMELIMIT in the environment wins
 )
 LOSSES = 3  # of the same part, before it is given up; dask has the same limit
-POLL_SECONDS = 1.0
+POLL_SECONDS = 1.0  # between looks for results
+QUEUE_SECONDS = 30.0  # between looks at SLURM's queue, which serves many
 
 
 @dataclass(frozen=True)
@@ -172,14 +174,14 @@ def run_with_slurm(
         GeneratorError: no SLURM here, or it refuses; a job failed, or was lost several times.
     """
     from submitit import AutoExecutor
-    from submitit.core.utils import FailedJobError, FailedSubmissionError, UncompletedJobError
+    from submitit.core.utils import FailedJobError, FailedSubmissionError
 
     todo = list(jobs)
     if not todo:
         return
     folder = shared.absolute() / "slurm"
     try:
-        executor = AutoExecutor(folder, cluster=SLURM_CLUSTER)
+        executor = AutoExecutor(folder, cluster="slurm")
     except RuntimeError as error:
         raise GeneratorError("executor slurm: there is no SLURM on this machine (srun is missing)") from error
     executor.update_parameters(
@@ -200,34 +202,78 @@ def run_with_slurm(
             raise GeneratorError(f"SLURM does not take the jobs: {error}") from error
 
     submitted = accepted(lambda: executor.map_array(part, parts))
-    pending = [(job, jobs_of, 0) for job, jobs_of in zip(submitted, parts, strict=True)]
+    pending = [_Submitted(job, jobs_of) for job, jobs_of in zip(submitted, parts, strict=True)]
+    queue = _Queue()
     try:
         while pending:
-            done = [entry for entry in pending if entry[0].done()]
+            results = set(folder.iterdir())  # unlike a look for one file, never out of a cache of NFS
+            done = [entry for entry in pending if entry.job.paths.result_pickle in results]
             for entry in done:
                 pending.remove(entry)
-                job, jobs_of, lost = entry
-                try:
-                    made = job.result()
-                except FailedJobError as error:
-                    raise GeneratorError(
-                        f"SLURM job {job.job_id} failed; its log is {job.paths.stdout}"
-                    ) from error
-                except UncompletedJobError as error:
-                    if lost + 1 == LOSSES:
-                        raise GeneratorError(
-                            f"SLURM job {job.job_id} was lost (out of memory?), as it was {lost} times before; its log "
-                            f"is {job.paths.stdout}; run the same command again to go on"
-                        ) from error
-                    again = accepted(partial(executor.submit, part, jobs_of))
-                    pending.append((again, jobs_of, lost + 1))
-                    continue
-                if isinstance(made, BenchError):
-                    raise made
-                yield from made
-            if not done:
-                time.sleep(POLL_SECONDS)
+                yield from entry.made()
+            if done:
+                continue
+            for job_id in queue.gone({entry.job.job_id for entry in pending}):
+                lost = next(entry for entry in pending if entry.job.job_id == job_id)
+                lost.check_losses()
+                pending.remove(lost)
+                again = accepted(partial(executor.submit, part, lost.todo))
+                pending.append(_Submitted(again, lost.todo, lost.losses + 1))
+            time.sleep(POLL_SECONDS)
     finally:
-        for job, _, _ in pending:
-            job.cancel(check=False)
+        for entry in pending:
+            entry.job.cancel(check=False)
     shutil.rmtree(folder)
+
+
+@dataclass(frozen=True)
+class _Submitted(Generic[Job]):
+    """A job of SLURM, what it does, and how often that was lost before."""
+
+    job: "SubmititJob[Any]"
+    todo: Sequence[Job]
+    losses: int = 0
+
+    def made(self) -> list[Any]:
+        """Its results, which are there; errors that a user can act on are raised."""
+        from submitit.core.utils import FailedJobError
+
+        try:
+            made = self.job.result()
+        except FailedJobError as error:
+            raise GeneratorError(
+                f"SLURM job {self.job.job_id} failed; its log is {self.job.paths.stdout}"
+            ) from error
+        if isinstance(made, BenchError):
+            raise made
+        return made
+
+    def check_losses(self) -> None:
+        """Raise an error if this loss is one too many."""
+        if self.losses + 1 == LOSSES:
+            raise GeneratorError(
+                f"SLURM job {self.job.job_id} was lost (out of memory?), as it was {self.losses} times before; its log "
+                f"is {self.job.paths.stdout}; run the same command again to go on"
+            )
+
+
+@dataclass
+class _Queue:
+    """What SLURM still has, by squeue: sacct, which submitit asks, tells nothing where there is no accounting."""
+
+    looked: float = field(default_factory=time.monotonic)
+    missing: set[str] = field(default_factory=set)
+
+    def gone(self, waiting: set[str]) -> set[str]:
+        """Those of these jobs that two looks in a row miss; a result has that long to become visible here."""
+        if time.monotonic() - self.looked < QUEUE_SECONDS:
+            return set()
+        self.looked = time.monotonic()
+        command = ["squeue", "--me", "--array", "--noheader", "--format=%i"]
+        answer = subprocess.run(command, capture_output=True, text=True, check=False)
+        if answer.returncode:  # its controller is busy, or away for a moment
+            return set()
+        missing = waiting - set(answer.stdout.split())
+        gone = missing & self.missing
+        self.missing = missing
+        return gone
