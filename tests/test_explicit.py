@@ -1,5 +1,7 @@
 """The explicit solver against closed forms, conservation laws and its own energy."""
 
+import sys
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -8,6 +10,7 @@ from conftest import box_of_tetrahedra
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.generators.errors import ParameterError, SolverError
+from m3gn_bench.generators.solvers import explicit_kernels
 from m3gn_bench.generators.solvers.captured import Course, Start
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 from m3gn_bench.generators.solvers.quiet_warp import wp
@@ -241,6 +244,17 @@ def test_together_each_moves_as_it_does_alone(element: Element) -> None:
 def test_what_is_one_number_for_all_must_be_the_same() -> None:
     with pytest.raises(ParameterError, match=r"must have one friction, not \['0.0', '0.5'\]"):
         thrown([solid(), solid(friction=0.5)], [20, 20])
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+def test_the_kernels_compile_for_cuda(tmp_path: Path) -> None:
+    """Which takes no GPU: Warp brings NVIDIA's compiler along."""
+    (binary,) = wp.compile_aot_module(explicit_kernels, arch=80, use_ptx=False, module_dir=tmp_path)
+    code = binary.read_bytes()
+    assert code.startswith(b"\x7fELF")
+    kernels = [name for name, value in vars(explicit_kernels).items() if isinstance(value, wp.Kernel)]
+    assert "move" in kernels
+    assert [name for name in kernels if name.encode() not in code] == []
 
 
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
