@@ -154,9 +154,10 @@ def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entr
     return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
 
 
-def _number(record: ResultRecord) -> tuple[int | str, ...]:
-    """The dataset's version as something that has an order."""
-    return tuple(int(part) if part.isdigit() else part for part in record.dataset_version.split("."))
+def _number(record: ResultRecord) -> tuple[tuple[int, str], ...]:
+    """The dataset's version as something that has an order; words come before numbers, as pre-releases do."""
+    parts = record.dataset_version.split(".")
+    return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in parts)
 
 
 def titles(records: Sequence[ResultRecord]) -> dict[str, str]:

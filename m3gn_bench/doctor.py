@@ -2,13 +2,12 @@
 
 import os
 import platform
-import re
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterator
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,6 +16,9 @@ from m3gn_bench.datasets.plugins import DISTRIBUTION, Kind, package_of, plugins
 from m3gn_bench.datasets.recorded import TOLERANCE, probe, read_record
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.version import __version__
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 PAPER_TIERS_GB = 2.5  # of all scenes together
 State = Literal["fine", "missing", "wrong"]
@@ -46,12 +48,25 @@ def examine(data: Path, self_test: bool, on_progress: Callable[[int, int], None]
         self_test: also simulate a trajectory of every scene and run a shipped model, which takes half a minute.
         on_progress: called with (done, total) after every part.
     """
-    parts = [machine, libraries, packages, devices, lambda: disk(data), meshes, board]
+    parts: dict[str, Callable[[], Iterator[Finding]]] = {
+        "machine": machine,
+        "libraries": libraries,
+        "packages": packages,
+        "devices": devices,
+        "disk": lambda: disk(data),
+        "meshes": meshes,
+        "leaderboard": board,
+    }
     if self_test:
-        parts += [simulations, predictions]
+        parts |= {"simulations": simulations, "predictions": predictions}
     found: list[Finding] = []
-    for done, part in enumerate(parts, 1):
-        found += part()
+    for done, (name, part) in enumerate(parts.items(), 1):
+        try:
+            for finding in part():
+                found.append(finding)
+        except Exception as error:  # a library that is broken or not there, which is what is looked for here
+            detail = f"cannot be looked at: {type(error).__name__}: {error}"
+            found.append(Finding(part="doctor", name=name, state="wrong", detail=detail))
         on_progress(done, len(parts))
     return found
 
@@ -73,23 +88,40 @@ def machine() -> Iterator[Finding]:
 
 def libraries() -> Iterator[Finding]:
     """Every library that the package asks for, and the extras that would bring those that are missing."""
+    from packaging.requirements import Requirement
+
     missing: dict[str, list[str]] = {}
-    for requirement in requires(DISTRIBUTION) or []:
-        name = re.split(r"[ <>=!~;\[(]", requirement, maxsplit=1)[0]
-        extra = re.search(r"extra == ['\"]([^'\"]+)['\"]", requirement)
-        if name == DISTRIBUTION or (extra is not None and extra[1] in ("test", "dev")):
+    for requirement in map(Requirement, requires(DISTRIBUTION) or []):
+        name, extra = requirement.name, _extra_of(requirement)
+        if name == DISTRIBUTION or extra in ("test", "dev"):
             continue
+        package = DISTRIBUTION if extra is None else f"{DISTRIBUTION}[{extra}]"
         try:
-            yield Finding(part="library", name=name, state="fine", detail=version(name))
+            found = version(name)
         except PackageNotFoundError:
             if extra is None:
-                detail = "required; install the package again"
+                detail = f"required; pip install {package}"
                 yield Finding(part="library", name=name, state="wrong", detail=detail)
             else:
-                missing.setdefault(extra[1], []).append(name)
+                missing.setdefault(extra, []).append(name)
+            continue
+        if requirement.specifier.contains(found, prereleases=True):
+            yield Finding(part="library", name=name, state="fine", detail=found)
+        else:
+            detail = f"{found} is installed, {requirement.specifier} is needed; pip install '{package}'"
+            yield Finding(part="library", name=name, state="wrong", detail=detail)
     for extra_name, names in missing.items():
         advice = f"without {', '.join(names)}; pip install 'm3gn-bench[{extra_name}]'"
         yield Finding(part="extra", name=extra_name, state="missing", detail=advice)
+
+
+def _extra_of(requirement: "Requirement") -> str | None:
+    """The extra that a requirement belongs to; None if it is always required."""
+    marker = requirement.marker
+    if marker is None or marker.evaluate({"extra": ""}):
+        return None
+    extras = metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+    return next((extra for extra in extras if marker.evaluate({"extra": extra})), None)
 
 
 def packages() -> Iterator[Finding]:

@@ -87,7 +87,10 @@ def report_command(
             "records": len(records),
             "studies": studied,
             "rollouts": {
-                one.task.name: {"models": one.models, "trajectories": [script.name for script in one.scripts]}
+                one.task.name: {
+                    "models": list(one.models.values()),
+                    "trajectories": [script.name for script in one.scripts],
+                }
                 for one in shown
             },
             "notes": notes,

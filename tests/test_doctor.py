@@ -2,8 +2,9 @@
 
 import json
 import shutil
+import sys
 from collections import namedtuple
-from importlib.metadata import PackageNotFoundError
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
@@ -32,13 +33,25 @@ def test_a_missing_extra_is_advice_and_a_missing_library_is_wrong(monkeypatch: p
     def installed(name: str) -> str:
         if name in ("newton", "h5py"):
             raise PackageNotFoundError(name)
-        return "1.0"
+        return "0.1" if name == "torch" else version(name)
 
     monkeypatch.setattr(doctor, "version", installed)
     found = list(doctor.libraries())
-    assert states(found)["h5py"] == "wrong"
-    (advice,) = [finding for finding in found if finding.state == "missing"]
+    assert {name for name, state in states(found).items() if state == "wrong"} == {"h5py", "torch"}
+    assert "0.1 is installed, <2.14,>=2.4 is needed" in next(f.detail for f in found if f.name == "torch")
+    (advice,) = [finding for finding in found if finding.name == "newton"]
     assert "pip install 'm3gn-bench[newton]'" in advice.detail
+
+
+def test_what_cannot_be_looked_at_is_one_line_among_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    found = doctor.examine(tmp_path, self_test=False, on_progress=lambda done, total: None)
+    (line,) = [finding for finding in found if finding.part == "doctor"]
+    assert (line.name, line.state) == ("devices", "wrong")
+    assert "ModuleNotFoundError" in line.detail
+    assert {"library", "mesh", "leaderboard"} <= {finding.part for finding in found}
 
 
 def test_a_full_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -381,6 +381,29 @@ def test_predictions_are_drawn_beside_them(command: Command, tmp_path: Path) -> 
     )
 
 
+def test_a_point_with_an_axis_of_its_own(command: Command, tmp_path: Path) -> None:
+    """As some readers of these files expect it."""
+
+    def with_axis(seed: int) -> dict[str, Any]:
+        made = tissue(seed)
+        return made | {"gripper_position": made["gripper_position"][:, None]}
+
+    paths = []
+    for number, make in enumerate((tissue, with_axis)):
+        folder = write_ggns(tmp_path / f"tissue{number}", make)
+        out, _ = imported(command, Published(folder, "ggns", "tissue_manipulation"))
+        paths.append(read(out, "tissue_manipulation", "test", 0).collider_positions)
+        out.rename(tmp_path / f"{number}.h5")
+    np.testing.assert_array_equal(paths[0], paths[1])
+
+
+def test_names_that_are_no_words(command: Command, tmp_path: Path) -> None:
+    for number, entry in enumerate(({0: 1}, {0: 1, "a": 2})):
+        path = tmp_path / f"names{number}_train.pkl"
+        path.write_bytes(pickle.dumps([entry]))
+        assert_refused(command("import", path, *GGNS), "unknown entry 'nodes_grid'; known: 0")
+
+
 def test_numbers_of_ggns(command: Command, tmp_path: Path) -> None:
     folder = write_ggns(tmp_path / "plates")
     out, _ = imported(command, Published(folder, "ggns", "deformable_block"))

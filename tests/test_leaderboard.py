@@ -415,9 +415,10 @@ def test_records_that_cannot_be_are_refused(
 def test_a_board_compares_like_with_like(board: Path) -> None:
     """Older data do not count beside newer ones, and other trajectories are refused."""
     one, other = read_records(board)
-    old = one.model_copy(update={"dataset_version": "1.9"})
-    new = other.model_copy(update={"dataset_version": "1.10"})
-    assert [row.label for row in summary.entries([old, new], one.track, one.task)] == [new.model]
+    for older, newer in (("1.9", "1.10"), ("1.0b", "1.0"), ("1", "1.1")):
+        old = one.model_copy(update={"dataset_version": older})
+        new = other.model_copy(update={"dataset_version": newer})
+        assert [row.label for row in summary.entries([old, new], one.track, one.task)] == [new.model]
     with pytest.raises(BenchError, match="tier quick"):
         summary.entries([one, other.model_copy(update={"tier": "quick"})], one.track, one.task)
 

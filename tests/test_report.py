@@ -25,7 +25,15 @@ from m3gn_bench.leaderboard.record import checkpoint_folder, read_records, write
 from m3gn_bench.leaderboard.site.board import board_rows
 from m3gn_bench.leaderboard.site.build import build
 from m3gn_bench.leaderboard.site.markdown import to_page
-from m3gn_bench.leaderboard.site.rollouts import LARGEST, choose, is_closed, kept_frames, pack, runnable
+from m3gn_bench.leaderboard.site.rollouts import (
+    LARGEST,
+    Rollouts,
+    choose,
+    is_closed,
+    kept_frames,
+    pack,
+    runnable,
+)
 from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")
@@ -229,6 +237,30 @@ def test_what_records_say_is_text(tmp_path: Path) -> None:
     assert "No checkpoint can be shown" in (tmp_path / "rollouts.html").read_text()
 
 
+def column(site: Path, name: str) -> list[str]:
+    """The texts of a column of the leaderboard."""
+    table = (site / "index.html").read_text().partition('<table id="board"')[2].partition("</table>")[0]
+    cells = [text for _, text in Elements(f"<table{table}</table>").of("th", "td")]
+    columns = table.count('<th scope="col"')
+    return cells[columns + cells.index(name) :: columns]
+
+
+def test_a_time_with_several_threads_is_left_out(tmp_path: Path) -> None:
+    times = []
+    for threads in (1, 2):
+        record = made_up("m3gn", 1.0).model_copy(update={"evaluation_threads": threads})
+        build(tmp_path, [record], ([], []), None)
+        times.append(column(tmp_path, "prediction [ms]"))
+    assert all(float(time) > 0 for time in times[0])
+    assert set(times[1]) == {""}
+
+
+def test_records_of_a_task_that_is_not_installed_are_shown(tmp_path: Path) -> None:
+    build(tmp_path, [made_up("m3gn", 1.0).model_copy(update={"task": "elsewhere"})], ([], []), None)
+    assert set(column(tmp_path, "task")) == {"elsewhere"}
+    assert (tmp_path / "figures" / "errors-compact-elsewhere.svg").exists()
+
+
 def test_an_empty_board_has_pages_too(tmp_path: Path) -> None:
     build(tmp_path, [], ([], []), None)
     assert "There are no records yet" in (tmp_path / "index.html").read_text()
@@ -353,7 +385,19 @@ def test_what_is_not_on_record_is_not_shown(home: Path) -> None:
     assert [one.label for one in found] == ["m3gn", "mgn"]
     assert left_out == []
     assert "dataset version" in runnable(records, TASK, "0.9", home)[1][0]
-    assert "not the one that was recorded" in runnable(records, TASK, version, home / "elsewhere")[1][1]
+    assert "no checkpoint in" in runnable(records, TASK, version, home / "elsewhere")[1][1]
+    other = records[0].checkpoint.model_copy(update={"best_step": 99})
+    changed = [record.model_copy(update={"checkpoint": other}) for record in records]
+    assert "not the one that was recorded" in runnable(changed, TASK, version, home)[1][0]
+
+
+def test_every_shipped_checkpoint_can_be_watched(home: Path, tmp_path: Path) -> None:
+    """Also where several are of the same model."""
+    (record,) = (r for r in read_records(home) if r.model == "m3gn" and r.ships)
+    labels = {record.name: "m3gn-smoke-s0", "m3gn-smoke-s1": "m3gn-smoke-s1"}
+    build(tmp_path, [record], ([], []), [Rollouts(TASK, labels, ())])
+    assert column(tmp_path, "rollouts") == ["watch"] * 3
+    assert f"rollouts.html#{TASK.name}/m3gn-smoke-s0/5" in (tmp_path / "index.html").read_text()
 
 
 def test_numbers_are_packed() -> None:

@@ -84,8 +84,10 @@ class GgnsSource:
     def _found(self, entry: dict, where: str) -> Found:
         names, dimension = self.names, self.names.dimension
         positions = array(entry, names.positions, where, (None, None, dimension))
-        if names.collider_edges is None:  # a single point
-            path = array(entry, names.collider, where, (None, dimension))[:, None]
+        if names.collider_edges is None:  # a single point, with an axis of its own or without
+            own_axis = getattr(entry.get(names.collider), "ndim", 2) == 3
+            shape = (None, 1, dimension) if own_axis else (None, dimension)
+            path = array(entry, names.collider, where, shape).reshape(-1, 1, dimension)
             edges = None
         else:
             path = array(entry, names.collider, where, (None, None, dimension))

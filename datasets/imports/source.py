@@ -170,7 +170,7 @@ def array(
 def required(entry: Mapping[str, Any], name: str, where: str) -> Any:
     """An entry of that name. Raises DatasetError listing the entries if there is none."""
     if name not in entry:
-        known = sorted(entry)
+        known = sorted(map(str, entry))
         more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
         raise DatasetError(f"{where}: {unknown_name('entry', name, known[:LISTED])}{more}")
     return entry[name]

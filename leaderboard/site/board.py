@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.render import tracks_of
-from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_below
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_below, titles
 
 TINY = 1e-30  # an error of zero has no place on a logarithmic scale
 
@@ -62,7 +61,7 @@ def board_rows(
         records: what to show.
         on_progress: called with (done, total) after every track and task.
     """
-    boards = [(track, task) for track in tracks_of(records) for task in TASKS]
+    boards = [(track, task) for track in tracks_of(records) for task in titles(records)]
     result: list[Row] = []
     for done, (track, task) in enumerate(boards, 1):
         found = entries(records, track, task)

@@ -16,10 +16,9 @@ from m3gn_bench.leaderboard.render import TRACKS, tracks_of
 from m3gn_bench.leaderboard.site.board import board_rows, digits, groups_of
 from m3gn_bench.leaderboard.site.markdown import Page, to_line, to_page
 from m3gn_bench.leaderboard.site.rollouts import Rollouts
-from m3gn_bench.leaderboard.summary import middle
+from m3gn_bench.leaderboard.summary import middle, titles
 from m3gn_bench.stability import Stability
 from m3gn_bench.study_page import draw, render
-from m3gn_bench.tasks import TASKS
 from m3gn_bench.tradeoff import TradeOff
 from m3gn_bench.version import __version__
 
@@ -34,9 +33,10 @@ class Site:
     Args:
         folder: where it goes.
         pages: file name and title of all pages that the menu has.
+        titles: of tasks by name.
     """
 
-    def __init__(self, folder: Path, pages: Mapping[str, str]) -> None:
+    def __init__(self, folder: Path, pages: Mapping[str, str], titles: Mapping[str, str]) -> None:
         self.folder, self.pages = folder, pages
         self.files: list[Path] = []
         self.templates = Environment(
@@ -47,7 +47,7 @@ class Site:
             lstrip_blocks=True,
         )
         self.templates.filters |= {"micro": lambda value: digits(1e6 * value), "digits": digits}
-        self.templates.globals |= {"pages": pages, "version": __version__, "tasks": TASKS}
+        self.templates.globals |= {"pages": pages, "version": __version__, "titles": titles}
 
     def page(self, name: str, template: str, **values: Any) -> None:
         """Write a page; `values` are what its template names. Pages below another one name it as `parent`."""
@@ -97,7 +97,7 @@ def build(
     }
     if rollouts is None:
         del pages["rollouts.html"]
-    site = Site(folder, pages)
+    site = Site(folder, pages, titles(records))
     for path in sorted((HERE / "static").iterdir()):
         if rollouts is not None or path.name not in ("viewer.js", "rollouts.js"):
             site.write(path.name, path.read_bytes())
@@ -118,6 +118,9 @@ def _leaderboard(
     on_progress: Callable[[int, int], None],
 ) -> None:
     rows = board_rows(records, on_progress)
+    contexts: dict[str, set[int]] = {}
+    for row in rows:
+        contexts.setdefault(row.task, set()).add(row.context)
     site.page(
         "index.html",
         "leaderboard.html",
@@ -125,15 +128,15 @@ def _leaderboard(
         groups=groups_of(rows),
         tracks={name: to_line(TRACKS.get(name, "")) for name in tracks_of(records)},
         contexts=sorted({row.context for row in rows}),
-        middles={name: middle(task.context_sizes) for name, task in TASKS.items()},
-        watchable={(one.task.name, model) for one in rollouts for model in one.models},
+        middles={name: middle(list(sizes)) for name, sizes in contexts.items()},
+        watchable={(one.task.name, name): label for one in rollouts for name, label in one.models.items()},
     )
 
 
 def _curves(site: Site, records: Sequence[ResultRecord]) -> None:
     figures = []
     for track in tracks_of(records):
-        for name in TASKS if track not in NOT_DRAWN else ():
+        for name in titles(records) if track not in NOT_DRAWN else ():
             figure = draw_board(records, track, name)
             if figure is not None:
                 figures.append((track, name, site.figure(f"errors-{track}-{name}.svg", figure)))
@@ -158,7 +161,7 @@ def _rollouts(site: Site, rollouts: Sequence[Rollouts]) -> None:
         {
             "task": one.task.name,
             "title": one.task.title,
-            "models": one.models,
+            "models": list(one.models.values()),
             "contexts": one.task.context_sizes,
             "trajectories": [{"name": s.name, "label": s.label} for s in one.scripts],
         }

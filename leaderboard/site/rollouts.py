@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from m3gn_bench.checkpoint import load_checkpoint, read_description
+from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.data import Case, case_from
+from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import Trajectory
@@ -33,11 +34,11 @@ COLOURED = 98.0  # percentile of distances that gets the last colour
 
 @dataclass(frozen=True, eq=False)
 class Runnable:
-    """A record whose checkpoint can be run, and what its model is called on the page."""
+    """A record, the model of its checkpoint, and what that is called on the page."""
 
     label: str
     record: ResultRecord
-    folder: Path
+    model: Model
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,13 @@ class Rollouts:
 
     Attributes:
         task: which one.
-        models: labels.
+        models: what the page calls them, by the records' names.
         scripts: one per trajectory.
         notes: what a reader should know, e.g. errors that differ from the records.
     """
 
     task: Task
-    models: tuple[str, ...]
+    models: dict[str, str]
     scripts: tuple[Script, ...]
     notes: tuple[str, ...] = ()
 
@@ -93,11 +94,17 @@ def runnable(
             left_out.append(
                 f"{where} was scored on dataset version {record.dataset_version}, and {version} is at hand"
             )
-        elif not folder.is_dir() or read_description(folder) != record.checkpoint:
+            continue
+        try:
+            model, description = load_checkpoint(folder)
+        except BenchError as error:  # no reason to have no site
+            left_out.append(f"{where}: {error}")
+            continue
+        if description != record.checkpoint:
             left_out.append(f"{where}: the checkpoint in {folder} is not the one that was recorded")
-        else:
-            label = record.model if models[record.model] == 1 else record.name
-            found.append(Runnable(label, record, folder))
+            continue
+        label = record.model if models[record.model] == 1 else record.name
+        found.append(Runnable(label, record, model))
     return found, left_out
 
 
@@ -117,13 +124,11 @@ def roll_out(
         on_progress: called with (done, total) after every prediction.
 
     Raises:
-        CheckpointError: a checkpoint is damaged.
-        DatasetError: the dataset is.
+        DatasetError: the dataset is damaged.
     """
     source = TrajectoryDataset(dataset, task.name, "test", tier)
     judge = next((model for model in models if model.record.model == "m3gn"), models[0])
     chosen = choose(judge.record, source.keys, middle(task.context_sizes))
-    loaded = [(model, load_checkpoint(model.folder)[0]) for model in models]
     total = len(chosen) * len(models) * len(task.context_sizes)
     scripts: list[Script] = []
     notes: list[str] = []
@@ -132,16 +137,16 @@ def roll_out(
         trajectory = source[source.keys.index(key)]
         case = case_from(task, source.metadata, trajectory, key)
         content = _scene(case, trajectory, source.metadata)
-        for one, model in loaded:
+        for one in models:
             for context in task.context_sizes:
-                content["predictions"].append(_prediction(content, case, one, model, context, notes))
+                content["predictions"].append(_prediction(content, case, one, context, notes))
                 done += 1
                 on_progress(done, total)
         name = f"{task.name}-{key}"
         label = f"{key}, {word} for {judge.label}: {_described(trajectory, source.metadata)}"
         script = f"rollouts[{json.dumps(name)}] = {json.dumps(content, separators=(',', ':'))};\n"
         scripts.append(Script(name, label, script.encode()))
-    return Rollouts(task, tuple(model.label for model in models), tuple(scripts), tuple(notes))
+    return Rollouts(task, {model.record.name: model.label for model in models}, tuple(scripts), tuple(notes))
 
 
 def choose(record: ResultRecord, keys: Sequence[str], context: int) -> dict[str, str]:
@@ -202,10 +207,10 @@ def _scene(case: Case, trajectory: Trajectory, metadata: Metadata) -> dict[str, 
 
 
 def _prediction(
-    scene: dict[str, Any], case: Case, one: Runnable, model: Model, context: int, notes: list[str]
+    scene: dict[str, Any], case: Case, one: Runnable, context: int, notes: list[str]
 ) -> dict[str, Any]:
     with torch.inference_mode():
-        predicted = model.predict(case.context(context))
+        predicted = one.model.predict(case.context(context))
     future = case.future(context)
     kept = [frame - context for frame in scene["frames"] if frame >= context]
     distances = (predicted - future).norm(dim=-1).numpy()[kept]

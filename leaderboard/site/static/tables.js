@@ -20,7 +20,7 @@ function sort(table, place, descending) {
   const order = keys.map((key, i) => i).sort((i, j) => {
     const [a, b] = [keys[i], keys[j]];
     if (a === null || b === null) return (a === null) - (b === null);
-    const difference = typeof a === "number" ? a - b : a.localeCompare(b);
+    const difference = typeof a === "number" ? a - b : a.localeCompare(b, undefined, { numeric: true });
     return descending ? -difference : difference;
   });
   const rows = [...table.tBodies[0].rows];
