@@ -5,6 +5,7 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
     track = "compact"
     tier = "paper"              # default
     split = "test"              # default; "validation" for trials of hyper-parameters
+    pace = "pace.jsonl"         # a file beside the plan: minutes are those of its machine, as steps (`pace`)
 
     [[runs]]
     tasks = ["deformable_block"]
@@ -12,12 +13,14 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
     seeds = [0, 1, 2]
     shipped_seeds = [0]         # whose checkpoints are kept beside the records
     preset = "compact"          # default
-    minutes = 10                # CPU minutes of training; or steps = 1000; neither for models that do not learn
+    minutes = 10                # of one core for training; or steps = 1000; neither for models that do not learn
     variant = "large rate"      # what is different here, if anything
     settings = { "training.learning_rate" = 4e-3 }
     materials = { youngs_modulus = [10, 1000] }  # only trajectories of these, in all splits
 """
 
+import hashlib
+import json
 import shutil
 import tomllib
 import traceback
@@ -33,6 +36,7 @@ from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.file import content_hash, open_file, read_metadata
 from m3gn_bench.datasets.schema import TIERS, Record, Split
 from m3gn_bench.errors import ConfigError
+from m3gn_bench.leaderboard.pace import Pace, read_pace
 from m3gn_bench.leaderboard.record import (
     Name,
     ResultRecord,
@@ -72,6 +76,7 @@ class Plan(Record):
     track: Name
     tier: str = "paper"
     split: Split = "test"
+    pace: str | None = None
     runs: tuple[Grid, ...] = Field(min_length=1)
 
 
@@ -123,11 +128,12 @@ def read_plan(path: Path) -> list[PlannedRun]:
         raise ConfigError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if plan.tier not in TIERS:
         raise ConfigError(f"{path}: tier: unknown {plan.tier!r}; known: {', '.join(TIERS)}")
+    pace = None if plan.pace is None else read_pace(path.parent / plan.pace)
     runs = []
     for number, grid in enumerate(plan.runs, 1):
         try:
             runs += [
-                _planned(plan, grid, task, model, seed)
+                _planned(plan, pace, grid, task, model, seed)
                 for seed in grid.seeds
                 for task in grid.tasks
                 for model in grid.models
@@ -141,9 +147,11 @@ def read_plan(path: Path) -> list[PlannedRun]:
     return sorted(runs, key=lambda run: run.seed)
 
 
-def _planned(plan: Plan, grid: Grid, task_name: str, model: str, seed: int) -> PlannedRun:
+def _planned(plan: Plan, pace: Pace | None, grid: Grid, task_name: str, model: str, seed: int) -> PlannedRun:
     task = get_task(task_name)
-    budget = {"training.minutes": grid.minutes, "training.steps": grid.steps}
+    budget: dict[str, float | None] = {"training.minutes": grid.minutes, "training.steps": grid.steps}
+    if pace is not None and grid.minutes is not None and grid.steps is None:
+        budget = {"training.steps": pace.steps(grid.preset, task_name, model, grid.minutes)}
     settings = grid.settings | {key: value for key, value in budget.items() if value is not None}
     config = load_preset(model, grid.preset, task, settings)
     require_budget(config, build_model(config, task).is_learned)
@@ -229,6 +237,8 @@ def carry_out(job: Job) -> Outcome:
         # An older run of that name, with other settings or data, is no obstacle.
         budget = run.config.training
         stamp = f"{run.config.hash()[:8]}-{budget.minutes or budget.steps or 0:g}-{version}"
+        if run.materials:
+            stamp += f"-{hashlib.sha256(json.dumps(run.materials).encode()).hexdigest()[:8]}"
         folder /= f"{run.name}-{stamp}"
         train(run.config, task, training, validation, folder, seed=run.seed, dataset_hash=dataset_hash)
         record = score(

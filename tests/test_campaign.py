@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -213,15 +214,52 @@ def test_shipped_plans_can_be_read() -> None:
     plans = {path.stem: read_plan(path) for path in PLANS.glob("*.toml")}
     assert {"compact", "ablations", "tuning", "smoke"} <= set(plans)
     for name in ("compact", "ablations", "tuning"):
-        assert len({run.config.training.minutes for run in plans[name]} - {None}) == 1
+        grids = tomllib.loads((PLANS / f"{name}.toml").read_text())["runs"]
+        assert len({grid["minutes"] for grid in grids if "minutes" in grid}) == 1
     trials = dict.fromkeys({run.config.model_name for run in plans["tuning"]}, 0)
     for planned in plans["tuning"]:
         assert planned.split == "validation"
         trials[planned.config.model_name] += 1
     assert len(set(trials.values())) == 1
     assert set(trials) == {
-        run.config.model_name for run in plans["compact"] if run.config.training.minutes is not None
+        run.config.model_name for run in plans["compact"] if run.config.training.steps is not None
     }
+
+
+def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
+    lines = [
+        {"preset": "smoke", "task": "sheet_deformation", "model": model, "steps_per_minute": pace}
+        | {"machine": "one", "commit": None}
+        for model, pace in (("mgn", 120.5), ("m3gn", 33.3))
+    ]
+    path = tmp_path / "pace.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    grid = GRID.replace('["mgn"]', '["mgn", "m3gn"]').replace("steps = 3", "minutes = 2")
+    plan = write(tmp_path, grid, head=HEAD + 'pace = "pace.jsonl"\n')
+    found = {run.config.model_name: run.config.training for run in read_plan(plan)}
+    assert {name: (budget.steps, budget.minutes) for name, budget in found.items()} == {
+        "mgn": (241, None),
+        "m3gn": (67, None),
+    }
+    path.write_text(json.dumps(lines[0]) + "\n")
+    with pytest.raises(ConfigError, match=r"has no pace of m3gn with preset 'smoke' on sheet_deformation"):
+        read_plan(plan)
+    path.write_text(json.dumps(lines[0]) + "\n" + json.dumps(lines[1] | {"machine": "another"}) + "\n")
+    with pytest.raises(ConfigError, match="must be of one machine, and is of another, one"):
+        read_plan(plan)
+    path.write_text("{}\n")
+    with pytest.raises(ConfigError, match="cannot read the pace"):
+        read_plan(plan)
+
+
+def test_runs_on_other_materials_have_folders_of_their_own(smoke_file: Path, tmp_path: Path) -> None:
+    everything = "10, 60, 180, 500, 1000"
+    for moduli in (everything, f"{everything}, 2000"):
+        grid = GRID + f"materials = {{ youngs_modulus = [{moduli}] }}\n"
+        (planned,) = read_plan(write(tmp_path, grid))
+        outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
+        assert outcome.error is None, outcome.error
+    assert len(list((tmp_path / "runs" / "trial" / "sheet_deformation").iterdir())) == 2
 
 
 def test_presets_have_the_rates_of_the_trials() -> None:

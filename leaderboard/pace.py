@@ -1,0 +1,69 @@
+"""How many steps of training each model makes per minute on one reference machine.
+
+Machines differ by a factor of two, and by another one from model to model. So plans give every model the steps that it
+makes in the same time on one core of one machine, which any other machine can repeat to the last digit.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field, ValidationError
+
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.errors import ConfigError
+
+
+class Measured(Record):
+    """One model's pace with a preset on a task's paper tier; one line of a file."""
+
+    preset: str
+    task: str
+    model: str
+    steps_per_minute: float = Field(gt=0)  # of CPU time
+    machine: str
+    commit: str | None
+
+
+@dataclass(frozen=True)
+class Pace:
+    """All that was measured on one machine.
+
+    Attributes:
+        path: of the file.
+        machine: which one.
+        steps_per_minute: by preset, task and model.
+    """
+
+    path: Path
+    machine: str
+    steps_per_minute: Mapping[tuple[str, str, str], float]
+
+    def steps(self, preset: str, task: str, model: str, minutes: float) -> int:
+        """The steps of so many minutes of one core. Raises ConfigError where nobody measured."""
+        try:
+            return round(minutes * self.steps_per_minute[preset, task, model])
+        except KeyError:
+            raise ConfigError(
+                f"{self.path} has no pace of {model} with preset {preset!r} on {task}; measure it with "
+                "benchmarks/pace.py, or leave out `pace` for minutes of the machine that trains"
+            ) from None
+
+
+def read_pace(path: Path) -> Pace:
+    """Read a file that benchmarks/pace.py wrote.
+
+    Raises:
+        ConfigError: there is none, it is damaged, or of several machines.
+    """
+    try:
+        lines = [Measured.model_validate(json.loads(line)) for line in path.read_text().splitlines()]
+    except (OSError, ValueError, ValidationError) as error:
+        raise ConfigError(f"cannot read the pace of models in {path}: {error}") from error
+    machines = {line.machine for line in lines}
+    if len(machines) != 1:
+        raise ConfigError(f"{path} must be of one machine, and is of {', '.join(sorted(machines)) or 'none'}")
+    return Pace(
+        path, machines.pop(), {(line.preset, line.task, line.model): line.steps_per_minute for line in lines}
+    )
