@@ -24,7 +24,7 @@ from m3gn_bench.training import Run
 
 PACE = Path(__file__).parents[1] / "leaderboard" / "plans" / "pace.jsonl"
 WARM_STEPS = 5
-SECONDS = 20.0  # of CPU time
+SECONDS = 15.0  # of CPU time
 
 
 def measure(preset: str, task: str, model: str, data: Path) -> Record:

@@ -10,6 +10,8 @@ from m3gn_bench.model import RunConfig, build_model, model_names
 from m3gn_bench.sources import dataset_version, number_of_trajectories
 from m3gn_bench.tasks import TASKS
 
+OVERTIME = 1.1  # a budget in minutes ends with the step that exceeds it
+
 
 def contradictions(record: ResultRecord) -> list[str]:
     """One sentence each; none where all is well.
@@ -51,4 +53,9 @@ def _of_the_configuration(record: ResultRecord) -> list[str]:
         found.append(f"config_hash: {described.config_hash}, not {config.hash()}")
     if parameters != record.parameters:
         found.append(f"parameters: {record.parameters}, not {parameters}")
+    budget = config.training
+    if budget.steps is not None and described.steps not in (0, budget.steps):
+        found.append(f"steps: {described.steps}, not the {budget.steps} of its settings")
+    if budget.minutes is not None and described.minutes > OVERTIME * budget.minutes:
+        found.append(f"minutes: {described.minutes:.3g}, not the {budget.minutes:.3g} of its settings")
     return found

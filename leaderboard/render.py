@@ -24,8 +24,9 @@ than M3GN's (seeds and trajectories resampled). `m3gn-bench leaderboard check` r
 
 # In this order; tracks that are not named here come last.
 TRACKS = {
-    "compact": "Small networks on the data of tier `paper`, each for the same ten minutes of one core "
-    "([plan](plans/compact.toml)).",
+    "compact": "Small networks on the data of tier `paper`, each for the steps that it makes in ten minutes of one "
+    "core of the machine that [pace.jsonl](plans/pace.jsonl) names ([plan](plans/compact.toml)). *Training* says how "
+    "many minutes of one core they took where they were made.",
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, for as long as one core allowed ([plan](plans/paper.toml)): "
     "not the paper's training, which took days on a GPU.",
@@ -54,8 +55,13 @@ def render(records: Sequence[ResultRecord], pictures: Collection[str] = ()) -> s
         parts.append(f"## Track: {track}\n\n{TRACKS.get(track, '')}\n")
         for name, task_title in titles(records).items():
             rows = entries(records, track, name)
-            if rows:
-                parts.append(_task_table(task_title, rows))
+            whole = [row for row in rows if not row.records[0].materials]
+            if len(whole) < len(rows):  # not comparable with the others, and a table of their own
+                parts.append(
+                    _task_table(f"{task_title}, some materials", [r for r in rows if r not in whole])
+                )
+            if whole:
+                parts.append(_task_table(task_title, whole))
                 if track == "compact" and any(row.label in STYLES for row in rows):
                     parts.append(f"![Errors over context frames and over time]({FIGURES}/{name}.svg)\n")
                     parts += [
@@ -72,13 +78,13 @@ def _task_table(title: str, rows: Sequence[Entry]) -> str:
     contexts = sorted({context for row in rows for context in row.contexts})
     at = middle(contexts)
     first = rows[0].records[0]
-    trajectories = max(len(row.records[0].keys) for row in rows)
+    counts = " or ".join(map(str, sorted({len(row.records[0].keys) for row in rows})))
     m3gn = next((row for row in rows if row.label == "m3gn"), None)
     lines = [
         f"### {title}",
         "",
-        f"{trajectories} {first.split} trajectories of tier `{first.tier}`, dataset version {first.dataset_version}; "
-        f"sorted by the error at context {at}.",
+        f"{counts} {first.split} trajectories of tier `{first.tier}`, dataset version {first.dataset_version}; sorted by "
+        f"the error at context {at}.",
         "",
         _row(["model", "seeds", "parameters", "training", *(f"context {c}" for c in contexts), "P"]),
         _row(["---", "--:", "--:", "--:", *("--:" for _ in contexts), "--:"]),

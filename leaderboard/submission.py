@@ -37,6 +37,8 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         problems.append(
             f"there is a record of {record.task}/{record.name} already; give --replace to replace it"
         )
+    if record.materials and not record.variant:
+        problems.append("it is of some materials only; name them by a variant")
     problems += contradictions(record)
     if record.model not in model_names():
         remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
@@ -69,11 +71,12 @@ def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> 
     """In what a submission differs from the records that it would stand beside, where all must be equal."""
 
     def conditions(of: ResultRecord) -> dict[str, object]:
-        settings = of.checkpoint.config.training
         trained = of.checkpoint
-        budget = {name: settings.get(name) for name in ("minutes", "steps")} if trained.steps else {}
         where = {"device": trained.device, "threads": trained.threads, "processes": trained.processes}
-        return {"tier": of.tier, "split": of.split} | budget | (where if trained.steps else {})
+        return {"tier": of.tier, "split": of.split} | (where if trained.steps else {})
+
+    def budget(of: ResultRecord) -> dict[str, object]:
+        return {name: of.checkpoint.config.training.get(name) for name in ("minutes", "steps")}
 
     beside = [peer for peer in board if (peer.track, peer.task) == (record.track, record.task)]
     own = conditions(record)
@@ -86,7 +89,12 @@ def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> 
             )
     for peer in beside:
         same_row = (peer.model, peer.preset, peer.variant) == (record.model, record.preset, record.variant)
-        if same_row and peer.checkpoint.config_hash != record.checkpoint.config_hash:
+        if not same_row:
+            continue
+        if peer.checkpoint.config_hash != record.checkpoint.config_hash or peer.materials != record.materials:
             problems.append(f"its settings are not those of {peer.name}; name what differs by a variant")
+            break
+        if budget(peer) != budget(record):
+            problems.append(f"its budget is {budget(record)}, but {budget(peer)} for {peer.name}")
             break
     return problems

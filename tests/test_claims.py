@@ -108,6 +108,24 @@ def test_no_worse_allows_a_margin(monkeypatch: pytest.MonkeyPatch, first: float,
     assert verdict_of(monkeypatch, rows(a=1.0, b=1.0), below("a", "b")) == "undecided"
 
 
+@pytest.mark.parametrize(("second", "verdict"), [(11.0, "reproduced"), (5.0, "not reproduced")])
+def test_a_negative_margin_asks_for_more(
+    monkeypatch: pytest.MonkeyPatch, second: float, verdict: str
+) -> None:
+    """An order of magnitude, say."""
+    records = rows(a=1.0, b=second)
+    assert verdict_of(monkeypatch, records, below("a", "b", margin=-0.9)) == verdict
+    assert verdict_of(monkeypatch, records, below("a", "b")) == "reproduced"
+
+
+def test_seeds_that_differ_as_much_as_models_decide_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lowest of one are below the highest of the other; the bootstrap alone would take sides."""
+    records = [made_up("a", error, seed=seed) for seed, error in enumerate((1.0, 1.2, 2.0))]
+    records += [made_up("b", error, seed=seed) for seed, error in enumerate((1.8, 3.0, 5.0))]
+    assert claims.probability_of_less(*claims.entries(records, "compact", "sheet_deformation"), 5) > 0.975
+    assert verdict_of(monkeypatch, records, below("a", "b")) == "undecided"
+
+
 def test_what_holds_in_part_or_has_no_record(monkeypatch: pytest.MonkeyPatch) -> None:
     records = rows(a=1.0, b=2.0, c=0.5)
     mixed = verdict_of(monkeypatch, records, below("a", "b"), below("a", "c"))
@@ -125,6 +143,8 @@ def test_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdict_of(monkeypatch, slow, faster) == "reproduced"
     assert verdict_of(monkeypatch, slow, below("b", "a", of_time=True)) == "not reproduced"
     assert verdict_of(monkeypatch, records, faster) == "undecided"
+    elsewhere = [r.model_copy(update={"machine": "another"}) if r.model == "b" else r for r in slow]
+    assert verdict_of(monkeypatch, elsewhere, faster) == "not measured yet"
     threads = [r.model_copy(update={"evaluation_threads": 2}) for r in slow]
     assert verdict_of(monkeypatch, threads, faster) == "not measured yet"
 
@@ -133,7 +153,7 @@ def test_contexts_and_common_trajectories(monkeypatch: pytest.MonkeyPatch) -> No
     """A model against itself at another context size, and rows that share only some trajectories."""
     # Seeds differ far more than contexts do, but each of them is better with more context.
     records = [made_up("a", error, seed=seed) for seed, error in enumerate((1.0, 4.0, 16.0))]
-    records += [made_up("b", 32.0, seed=seed, keys=KEYS[3:9], variant="some") for seed in range(3)]
+    records += [made_up("b", 3200.0, seed=seed, keys=KEYS[3:9], variant="some") for seed in range(3)]
     assert verdict_of(monkeypatch, records, below("a", "a", context=10, worse_context=2)) == "reproduced"
     assert verdict_of(monkeypatch, records, below("a", "a", context=2, worse_context=10)) == "not reproduced"
     assert verdict_of(monkeypatch, records, below("a", "b (some)")) == "reproduced"

@@ -334,6 +334,12 @@ def training(**changes: object) -> Changes:
     return change
 
 
+def longer(record: ResultRecord) -> dict[str, Any]:
+    """Trained for more steps than the others of its row, and says so; another seed."""
+    changed = training(steps=600)(record)["checkpoint"].model_copy(update={"steps": 600, "seed": 1})
+    return {"track": "test", "seed": 1, "checkpoint": changed}
+
+
 def per_timestep(longer: int) -> Changes:
     """Errors over so many frames more."""
 
@@ -379,7 +385,10 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         ({"track": "test"}, "already"),
         ({"record_schema": 1}, "record_schema"),
         ({"track": "test", "seed": 1, "tier": "quick"}, "tier is quick, but smoke"),
-        (training(steps=600), "steps is 600, but 3"),
+        (training(steps=600), "steps: 3, not the 600 of its settings"),
+        (training(steps=None, minutes=1e-9), "minutes: "),
+        (longer, "its budget is {'minutes': None, 'steps': 600}, but"),
+        ({"materials": {"youngs_modulus": (10.0,)}}, "name them by a variant"),
         (checkpoint(device="cuda"), "device is cuda, but cpu"),
         (checkpoint(config_hash="0"), "config_hash: 0, not"),
         (training(optimizer="sgd"), "configuration: none of mgn"),

@@ -34,7 +34,7 @@ def test_variances_of_seeds_and_trajectories_add_up() -> None:
     seeds, trajectories = rng.normal(size=(5, 1)), rng.normal(size=(1, 80))
     means = bootstrap_means([10 + seeds + trajectories])[0]
     assert means.mean() == pytest.approx(10 + seeds.mean() + trajectories.mean(), abs=0.02)
-    assert means.var() == pytest.approx(seeds.var() / 5 + trajectories.var() / 80, rel=0.05)
+    assert means.var() == pytest.approx(seeds.var(ddof=1) / 5 + trajectories.var() / 80, rel=0.05)
 
 
 def test_models_are_compared_on_the_same_trajectories() -> None:
