@@ -83,8 +83,8 @@ def _task_table(title: str, rows: Sequence[Entry]) -> str:
     lines = [
         f"### {title}",
         "",
-        f"{counts} {first.split} trajectories of tier `{first.tier}`, dataset version {first.dataset_version}; sorted by "
-        f"the error at context {at}.",
+        f"{counts} {first.split} trajectories of tier `{first.tier}`, dataset version {first.dataset_version}; "
+        f"sorted by the error at context {at}.",
         "",
         _row(["model", "seeds", "parameters", "training", *(f"context {c}" for c in contexts), "P"]),
         _row(["---", "--:", "--:", "--:", *("--:" for _ in contexts), "--:"]),
