@@ -26,7 +26,7 @@ than M3GN's (seeds and trajectories resampled). `m3gn-bench leaderboard check` r
 TRACKS = {
     "compact": "Small networks on the data of tier `paper`, each for the steps that it makes in ten minutes of one "
     "core of the machine that [pace.jsonl](plans/pace.jsonl) names ([plan](plans/compact.toml)). *Training* says how "
-    "many minutes of one core they took where they were made.",
+    "many minutes of one core they took where they were made; *by the clock*: the budget was minutes of that machine.",
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, for as long as one core allowed ([plan](plans/paper.toml)): "
     "not the paper's training, which took days on a GPU.",
@@ -130,6 +130,8 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
 def _cells(row: Entry, contexts: Sequence[int], m3gn: Entry | None) -> Iterable[str]:
     minutes = row.training_minutes
     training = f"{minutes:.0f} min, {row.training_steps:.0f} steps" if minutes else "none"
+    if any(record.checkpoint.config.training.get("minutes") for record in row.records):
+        training += " (by the clock)"
     yield from (row.label, str(row.seeds), f"{row.parameters:,}".replace(",", " "), training)
     for context in contexts:
         if context not in row.contexts:
