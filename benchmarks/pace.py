@@ -2,14 +2,18 @@
 
     OMP_NUM_THREADS=1 python benchmarks/pace.py leaderboard/plans/compact.toml --data data
 
-Two of these at a time, each with a part of the runs (`--part 1/2`, `--part 2/2`), share a machine as a campaign does.
+All models of a task take short turns, and medians over turns count, so that what else the machine does meets all of
+them alike. Two of these at a time, each with a part of the tasks (`--part 1/2`, `--part 2/2`), share a machine as a
+campaign does.
 """
 
 import argparse
 import time
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 from results import Record, run_missing
 
 from m3gn_bench.cpu import use_cpu
@@ -23,31 +27,41 @@ from m3gn_bench.tasks import get_task
 from m3gn_bench.training import Run
 
 PACE = Path(__file__).parents[1] / "leaderboard" / "plans" / "pace.jsonl"
-WARM_STEPS = 5
-SECONDS = 15.0  # of CPU time
+TURNS = 5
+SECONDS, STEPS = 3.0, 3  # of a turn, at least; CPU time
+Models = Mapping[tuple[str, str], list[str]]  # by preset and task
 
 
-def measure(preset: str, task: str, model: str, data: Path) -> Record:
-    """The pace of one model, in a process of its own."""
+def measure(preset: str, task: str, models: Models, data: Path) -> Record:
+    """The pace of all models of a task, in a process of its own."""
     use_cpu(1)
     what = get_task(task)
-    config = load_preset(model, preset, what, {"training.minutes": 1.0})
     cases = load_cases(find_or_generate(what, "paper", data), what, "train", "paper")
-    built = build_model(config, what)
-    built.prepare(cases)
-    run = Run(config, built, 0, Path(), {})
-    for _ in range(WARM_STEPS):
-        run.step(cases)
-    steps, start = 0, time.process_time()
-    while time.process_time() - start < SECONDS:
-        run.step(cases)
-        steps += 1
-    pace = 60 * steps / (time.process_time() - start)
-    return {"steps_per_minute": round(pace, 1), "machine": machine(), "commit": commit()}
+    runs = {}
+    for name in models[preset, task]:
+        config = load_preset(name, preset, what, {"training.minutes": 1.0})
+        model = build_model(config, what)
+        model.prepare(cases)
+        runs[name] = Run(config, model, 0, Path(), {})
+        runs[name].step(cases)  # what is done but once
+    turns: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(TURNS):
+        for name, run in runs.items():
+            steps, start, spent = 0, time.process_time(), 0.0
+            while spent < SECONDS or steps < STEPS:
+                run.step(cases)
+                steps += 1
+                spent = time.process_time() - start
+            turns[name].append(60 * steps / spent)
+    return {
+        "steps_per_minute": {name: round(float(np.median(found)), 1) for name, found in turns.items()},
+        "machine": machine(),
+        "commit": commit(),
+    }
 
 
 def main() -> None:
-    """Measure what the file does not have yet."""
+    """Measure the tasks that the file does not have yet."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -57,15 +71,14 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=PACE)
     arguments = parser.parse_args()
     part, parts = map(int, arguments.part.split("/"))
-    names = [
-        {"preset": grid.preset, "task": task, "model": model}
-        for path in arguments.plans
-        for grid in Plan.model_validate(tomllib.loads(path.read_text())).runs
-        if grid.minutes is not None
-        for task in grid.tasks
-        for model in grid.models
-    ]
-    run_missing(arguments.output, names[part - 1 :: parts], measure, data=arguments.data)
+    models: dict[tuple[str, str], list[str]] = {}
+    for path in arguments.plans:
+        for grid in Plan.model_validate(tomllib.loads(path.read_text())).runs:
+            for task in grid.tasks if grid.minutes is not None else ():
+                known = models.setdefault((grid.preset, task), [])
+                known += [model for model in grid.models if model not in known]
+    names = [{"preset": preset, "task": task} for preset, task in models]
+    run_missing(arguments.output, names[part - 1 :: parts], measure, models=models, data=arguments.data)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field, ValidationError
 
@@ -16,12 +17,11 @@ from m3gn_bench.errors import ConfigError
 
 
 class Measured(Record):
-    """One model's pace with a preset on a task's paper tier; one line of a file."""
+    """The pace of models with a preset on a task's paper tier; one line of a file."""
 
     preset: str
     task: str
-    model: str
-    steps_per_minute: float = Field(gt=0)  # of CPU time
+    steps_per_minute: dict[str, Annotated[float, Field(gt=0)]]  # of CPU time, by model
     machine: str
     commit: str | None
 
@@ -64,6 +64,9 @@ def read_pace(path: Path) -> Pace:
     machines = {line.machine for line in lines}
     if len(machines) != 1:
         raise ConfigError(f"{path} must be of one machine, and is of {', '.join(sorted(machines)) or 'none'}")
-    return Pace(
-        path, machines.pop(), {(line.preset, line.task, line.model): line.steps_per_minute for line in lines}
-    )
+    paces = {
+        (line.preset, line.task, model): pace
+        for line in lines
+        for model, pace in line.steps_per_minute.items()
+    }
+    return Pace(path, machines.pop(), paces)

@@ -228,9 +228,11 @@ def test_shipped_plans_can_be_read() -> None:
 
 def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
     lines = [
-        {"preset": "smoke", "task": "sheet_deformation", "model": model, "steps_per_minute": pace}
-        | {"machine": "one", "commit": None}
-        for model, pace in (("mgn", 120.5), ("m3gn", 33.3))
+        {"preset": "smoke", "task": task, "steps_per_minute": paces, "machine": "one", "commit": None}
+        for task, paces in (
+            ("sheet_deformation", {"mgn": 120.5, "m3gn": 33.3}),
+            ("deformable_block", {"mgn": 99.0}),
+        )
     ]
     path = tmp_path / "pace.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -241,8 +243,8 @@ def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
         "mgn": (241, None),
         "m3gn": (67, None),
     }
-    path.write_text(json.dumps(lines[0]) + "\n")
-    with pytest.raises(ConfigError, match=r"has no pace of m3gn with preset 'smoke' on sheet_deformation"):
+    path.write_text(json.dumps(lines[1]) + "\n")
+    with pytest.raises(ConfigError, match=r"has no pace of mgn with preset 'smoke' on sheet_deformation"):
         read_plan(plan)
     path.write_text(json.dumps(lines[0]) + "\n" + json.dumps(lines[1] | {"machine": "another"}) + "\n")
     with pytest.raises(ConfigError, match="must be of one machine, and is of another, one"):
