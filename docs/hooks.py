@@ -135,7 +135,7 @@ def _show(path: str) -> str:
     for file in sorted(place.iterdir()):
         if f"{path}/{file.name}" in _found(*PAGES):
             parts.append(f"- [{file.stem}]({file.name})")
-        elif file.suffix in (".py", ".toml", ".json"):
+        elif file.suffix in (".py", ".toml", ".json", ".jsonl"):
             parts.append(f"\n## {file.name}\n\n{_source(file)}")
     return "\n".join(parts)
 
