@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python benchmarks/pace.py leaderboard/plans/compact.toml --data data
 
 All models of a task take short turns, and medians over turns count, so that what else the machine does meets all of
-them alike. Two of these at a time, each with a part of the tasks (`--part 1/2`, `--part 2/2`), share a machine as a
-campaign does.
+them alike. Any `--tier` will do: more trajectories are not larger ones. Two of these at a time, each with a part of the
+tasks (`--part 1/2`, `--part 2/2`), share a machine as a campaign does.
 """
 
 import argparse
@@ -32,11 +32,11 @@ SECONDS, STEPS = 3.0, 3  # of a turn, at least; CPU time
 Models = Mapping[tuple[str, str], list[str]]  # by preset and task
 
 
-def measure(preset: str, task: str, models: Models, data: Path) -> Record:
+def measure(preset: str, task: str, models: Models, tier: str, data: Path) -> Record:
     """The pace of all models of a task, in a process of its own."""
     use_cpu(1)
     what = get_task(task)
-    cases = load_cases(find_or_generate(what, "paper", data), what, "train", "paper")
+    cases = load_cases(find_or_generate(what, tier, data), what, "train", tier)
     runs = {}
     for name in models[preset, task]:
         config = load_preset(name, preset, what, {"training.minutes": 1.0})
@@ -67,6 +67,7 @@ def main() -> None:
     )
     parser.add_argument("plans", nargs="+", type=Path)
     parser.add_argument("--data", type=Path, default=Path("data"))
+    parser.add_argument("--tier", default="paper")
     parser.add_argument("--part", default="1/1", help="which of how many, e.g. 1/2")
     parser.add_argument("--output", type=Path, default=PACE)
     arguments = parser.parse_args()
@@ -78,7 +79,8 @@ def main() -> None:
                 known = models.setdefault((grid.preset, task), [])
                 known += [model for model in grid.models if model not in known]
     names = [{"preset": preset, "task": task} for preset, task in models]
-    run_missing(arguments.output, names[part - 1 :: parts], measure, models=models, data=arguments.data)
+    settings = {"models": models, "tier": arguments.tier, "data": arguments.data}
+    run_missing(arguments.output, names[part - 1 :: parts], measure, **settings)
 
 
 if __name__ == "__main__":

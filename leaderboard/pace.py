@@ -17,7 +17,7 @@ from m3gn_bench.errors import ConfigError
 
 
 class Measured(Record):
-    """The pace of models with a preset on a task's paper tier; one line of a file."""
+    """The pace of models with a preset on a task; one line of a file."""
 
     preset: str
     task: str
