@@ -213,8 +213,8 @@ def run_with_slurm(
                 yield from entry.made()
             if done:
                 continue
-            for job_id in queue.gone({entry.job.job_id for entry in pending}):
-                lost = next(entry for entry in pending if entry.job.job_id == job_id)
+            gone = queue.gone({entry.job.job_id for entry in pending})
+            for lost in [entry for entry in pending if entry.job.job_id in gone]:
                 lost.check_losses()
                 pending.remove(lost)
                 again = accepted(partial(executor.submit, part, lost.todo))
