@@ -193,11 +193,13 @@ class Job:
         run: which one.
         dataset: file with all splits of the run's tier.
         runs: folder of unfinished and finished training runs.
+        device: of torch, that trains and predicts.
     """
 
     run: PlannedRun
     dataset: Path
     runs: Path
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -240,7 +242,16 @@ def carry_out(job: Job) -> Outcome:
         if run.materials:
             stamp += f"-{hashlib.sha256(json.dumps(run.materials).encode()).hexdigest()[:8]}"
         folder /= f"{run.name}-{stamp}"
-        train(run.config, task, training, validation, folder, seed=run.seed, dataset_hash=dataset_hash)
+        train(
+            run.config,
+            task,
+            training,
+            validation,
+            folder,
+            seed=run.seed,
+            dataset_hash=dataset_hash,
+            device=job.device,
+        )
         record = score(
             folder,
             job.dataset,
@@ -250,6 +261,7 @@ def carry_out(job: Job) -> Outcome:
             variant=run.variant,
             materials=run.materials,
             ships=run.ships,
+            device=job.device,
         )
     except BenchError as error:
         return Outcome(run, folder, None, str(error))

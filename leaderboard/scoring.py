@@ -14,6 +14,7 @@ from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.record import HASH_DIGITS, ContextResult, ResultRecord
 from m3gn_bench.provenance import commit, machine
 from m3gn_bench.tasks import task_of_data
+from m3gn_bench.training import usable_device
 from m3gn_bench.version import __version__
 
 
@@ -28,6 +29,7 @@ def score(
     variant: str = "",
     materials: Materials | None = None,
     ships: bool = False,
+    device: str = "cpu",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResultRecord:
     """The record of a checkpoint's errors on a split of the data.
@@ -41,10 +43,12 @@ def score(
         variant: what differs from the model's preset, in a word.
         materials: only trajectories of these materials.
         ships: whether the checkpoint is kept beside the records.
+        device: of torch, that predicts.
         on_progress: called with (done, total) after every batch.
 
     Raises:
         CheckpointError, DatasetError: files that are damaged or do not fit.
+        ConfigError: the device cannot be used.
         BenchError: predictions that are not finite.
     """
     with open_file(dataset) as file:
@@ -53,7 +57,9 @@ def score(
         hashes = stored_hashes(file)
     task = task_of_data(read_description(checkpoint).task, metadata)
     model, described = load_checkpoint(checkpoint, task)
-    cases = load_cases(dataset, task, split, tier, materials)
+    where = usable_device(device)
+    model.to(where)
+    cases = [case.to(where) for case in load_cases(dataset, task, split, tier, materials)]
     start = time.perf_counter()
     errors = evaluate_model(model, cases, contexts or task.context_sizes, on_progress)
     seconds = time.perf_counter() - start
@@ -76,7 +82,7 @@ def score(
         package_version=__version__,
         commit=commit(),
         machine=machine(),
-        evaluation_device="cpu",
+        evaluation_device=device,
         evaluation_threads=torch.get_num_threads(),
         evaluation_seconds=seconds,
         checkpoint=described,

@@ -45,6 +45,7 @@ EXECUTOR = click.option(
     help="What runs them: this machine, the workers of a dask scheduler (extra `dask`), or SLURM (extra `slurm`), "
     "where --workers counts jobs at a time. On a cluster all folders must be on a file system that all workers see.",
 )
+DEVICE = click.option("--device", default="cpu", show_default=True, help="A torch device.")
 OnProgress = Callable[[int, int], None]
 
 

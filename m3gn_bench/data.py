@@ -139,12 +139,14 @@ class Context:
         positions: frames 1..T^c, scaled, shape [context_frames, nodes, dim]; the last is the anchor.
         horizon: number of frames to predict.
         collider_path: the collider's positions in all frames, shape [frames, collider_nodes, dim].
+        keys: the trajectories' names in the dataset.
     """
 
     body: Body
     positions: Tensor
     horizon: int
     collider_path: Tensor
+    keys: tuple[str, ...]
 
     @property
     def size(self) -> int:
@@ -185,7 +187,7 @@ class Case:
                 f"context size {size} is out of range: a trajectory of {self.frames} frames "
                 f"allows 2 to {self.frames - 1}"
             )
-        return Context(self.body, self.positions[:size], self.frames - size, self.collider_path)
+        return Context(self.body, self.positions[:size], self.frames - size, self.collider_path, self.keys)
 
     def future(self, size: int) -> Tensor:
         """The frames after a context of that size, shape [frames - size, nodes, dim]."""

@@ -8,7 +8,9 @@ from m3gn_bench.data import Case, join
 from m3gn_bench.metrics import TrajectoryErrors, concatenate, trajectory_errors
 from m3gn_bench.model import Model
 
-BATCH = 4  # trajectories predicted together: more leave a CPU's cache, and take longer each
+# Trajectories predicted together. More than a few leave a CPU's cache, and take longer each; a GPU waits for the CPU
+# to start its work, whatever there is to do.
+BATCH, BATCH_ON_ACCELERATOR = 4, 32
 
 
 def evaluate_model(
@@ -30,14 +32,16 @@ def evaluate_model(
     """
     was_training = model.training
     model.eval()
-    starts = range(0, len(cases), BATCH)
+    on_cpu = cases[0].positions.device.type == "cpu"
+    batch_size = BATCH if on_cpu else BATCH_ON_ACCELERATOR
+    starts = range(0, len(cases), batch_size)
     results: dict[int, TrajectoryErrors] = {}
     done, total = 0, len(starts) * len(context_sizes)
     with torch.inference_mode():
         for size in context_sizes:
             parts = []
             for start in starts:
-                batch = join(cases[start : start + BATCH])
+                batch = join(cases[start : start + batch_size])
                 predicted = model.predict(batch.context(size))
                 parts.append(trajectory_errors(batch.body, predicted, batch.future(size)))
                 done += 1

@@ -63,6 +63,9 @@ class Graph:
 
 def _by_group(groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Members grouped, those of a group in order, and where each of `count` groups begins."""
+    if groups.is_cuda:
+        sizes = torch.bincount(groups, minlength=count)
+        return torch.argsort(groups, stable=True), sizes.cumsum(0) - sizes
     members = np.arange(len(groups))
     # Counts instead of sorting, which takes five times as long.
     table = coo_array(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, OnProgress, Report, table
+from m3gn_bench.console import DATA, DEVICE, EXECUTOR, JSON, WORKERS, OnProgress, Report, table
 
 if TYPE_CHECKING:
     from m3gn_bench.leaderboard.campaign import Outcome, PlannedRun
@@ -306,12 +306,21 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
     default=os.cpu_count() or 1,
     help="Processes, each of which trains with one thread.  [default: all cores]",
 )
+@DEVICE
 @EXECUTOR
 @click.option("--status", is_flag=True, help="Only show what is done and what is left.")
 @DATA
 @JSON
 def campaign(
-    plan: Path, home: Path, runs: Path, workers: int, executor: str, status: bool, data: Path, as_json: bool
+    plan: Path,
+    home: Path,
+    runs: Path,
+    workers: int,
+    device: str,
+    executor: str,
+    status: bool,
+    data: Path,
+    as_json: bool,
 ) -> None:
     """Train and score all runs of a plan that have no record yet.
 
@@ -325,9 +334,11 @@ def campaign(
     from m3gn_bench.leaderboard.record import read_records
     from m3gn_bench.sources import dataset_version, find_or_generate
     from m3gn_bench.tasks import get_task
+    from m3gn_bench.training import usable_device
 
     report = Report(as_json)
     parse_executor(executor)
+    usable_device(device)
     planned = read_plan(plan)
     versions = {run.task: dataset_version(get_task(run.task)) for run in planned}
     records = read_records(home)
@@ -350,7 +361,7 @@ def campaign(
                         on_progress=on_progress,
                     )
             # Workers of a cluster start in folders of their own.
-            jobs = (Job(run, files[run.task].absolute(), runs.absolute()) for run in todo)
+            jobs = (Job(run, files[run.task].absolute(), runs.absolute(), device) for run in todo)
             training = run_jobs(carry_out, jobs, min(workers, len(todo)), executor=executor, shared=runs)
             with (
                 report.progress(f"training {len(todo)} runs") as on_progress,

@@ -118,12 +118,13 @@ class ContextEncoder(nn.Module):
         return latents.amax(0)
 
     def _observed(self, context: Context) -> Tensor:
-        """The context's frames, noisy if so configured, by the same noise whenever the same context is seen again."""
+        """The context's frames, noisy if so configured, the same whenever a trajectory is seen again."""
         if not self.config.context_noise:
             return context.positions
         parts = []
-        for frames in context.positions.split(context.body.node_counts, dim=1):
-            seed = zlib.crc32(frames[-1].cpu().numpy().tobytes())
+        frames_of_bodies = context.positions.split(context.body.node_counts, dim=1)
+        for key, frames in zip(context.keys, frames_of_bodies, strict=True):
+            seed = zlib.crc32(key.encode())
             noise = np.random.default_rng(seed).standard_normal(frames.shape, dtype=np.float32)
             parts.append(frames + self.config.context_noise * torch.from_numpy(noise).to(frames.device))
         observed = torch.cat(parts, dim=1)

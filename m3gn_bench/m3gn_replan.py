@@ -9,6 +9,7 @@ for the units of time and of displacements.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ class M3GNReplan(M3GN):
         """The first frames after the anchor, shape [frames, nodes, dim]."""
         positions, start = context.positions, context.size
         while len(positions) < start + frames:
-            seen = Context(context.body, positions, context.frames - len(positions), context.collider_path)
+            seen = replace(context, positions=positions, horizon=context.frames - len(positions))
             predicted = self.simulator(
                 seen, latent, self.velocity_scale, self.displacement_scale, self.config.segment
             )

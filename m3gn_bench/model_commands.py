@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from m3gn_bench.console import DATA, JSON, WORKERS, Report, table
+from m3gn_bench.console import DATA, DEVICE, JSON, WORKERS, Report, table
 
 if TYPE_CHECKING:
     from m3gn_bench.profiling import Profile, Ratios
@@ -45,7 +45,7 @@ DATASET = click.option(
 @click.option(
     "--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of torch, on the CPU."
 )
-@click.option("--device", default="cpu", show_default=True, help="A torch device.")
+@DEVICE
 @click.option("--tensorboard", is_flag=True, help="Write curves to the run's folder.")
 @DATASET
 @WORKERS
@@ -178,6 +178,7 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     help="Also write a result record below this folder (in a checkout: leaderboard).",
 )
 @DATASET
+@DEVICE
 @THREADS
 @WORKERS
 @DATA
@@ -194,6 +195,7 @@ def evaluate(
     track: str,
     record_home: Path | None,
     dataset: Path | None,
+    device: str,
     threads: int,
     workers: int,
     data: Path,
@@ -214,9 +216,11 @@ def evaluate(
     from m3gn_bench.model import get_model_class, model_names
     from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import TASKS, get_task
+    from m3gn_bench.training import usable_device
 
     report = Report(as_json)
     use_cpu(threads)
+    usable_device(device)  # refused before data are simulated
     get_model_class(model)
     part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
@@ -273,6 +277,7 @@ def evaluate(
                 split=part,
                 contexts=sizes,
                 ships=record_home is not None and _is_shipped(folder, record_home),
+                device=device,
                 on_progress=on_progress,
             )
         if record_home is not None:
@@ -371,7 +376,7 @@ def _parse_contexts(text: str) -> list[int]:
 @click.option(
     "--repetitions", type=click.IntRange(min=1), default=5, show_default=True, help="Of every timing."
 )
-@click.option("--device", default="cpu", show_default=True, help="A torch device.")
+@DEVICE
 @THREADS
 @WORKERS
 @DATA

@@ -295,7 +295,7 @@ def _longer(task: Task, factor: int) -> Given:
     case, size, frames = _case(task), _middle(task), factor * task.frames
     stays = case.collider_path[-1:].expand(frames - task.frames, -1, -1)
     path = torch.cat([case.collider_path, stays])
-    return Given(Context(case.body, case.positions[:size], frames - size, path), None)
+    return Given(Context(case.body, case.positions[:size], frames - size, path, case.keys), None)
 
 
 def _double(task: Task) -> Given:

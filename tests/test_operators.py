@@ -187,7 +187,7 @@ def test_egnos_horizon_is_fixed_and_its_tail_is_cut() -> None:
     size = 60
     path = torch.cat([case.collider_path, case.collider_path[-1:].expand(horizon, -1, -1)])[: size + horizon]
     with torch.inference_mode():
-        full = model.predict(Context(case.body, case.positions[:size], horizon, path))
+        full = model.predict(Context(case.body, case.positions[:size], horizon, path, case.keys))
     assert len(full) == horizon
     assert torch.equal(predict(model, case, size), full[: case.frames - size])
 
