@@ -10,7 +10,7 @@ from m3gn_bench.model import Model
 
 # Trajectories predicted together. More than a few leave a CPU's cache, and take longer each; a GPU waits for the CPU
 # to start its work, whatever there is to do.
-BATCH, BATCH_ON_ACCELERATOR = 4, 16
+BATCH, BATCH_ON_ACCELERATOR = 4, 20
 
 
 def evaluate_model(
