@@ -114,8 +114,8 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
     lines = [
         "### Time per prediction",
         "",
-        "Milliseconds for a trajectory, mean over context sizes; one thread, batches of four, while a campaign's other "
-        "processes have the other cores.",
+        "Milliseconds for a trajectory, mean over context sizes; one thread of a CPU, batches of four, while a campaign's "
+        "other processes have the other cores. Empty where all of a method's seeds were scored on a GPU.",
         "",
         _row(["model", *(shown[name] for name in boards)]),
         _row(["---", *("--:" for _ in boards)]),
