@@ -50,6 +50,12 @@ class CheckReport(Record):
         return cls(ok=ok, compared=tuple(compared), problems=tuple(problems))
 
 
+def sample(records: Sequence[ResultRecord], count: int, offset: int) -> list[ResultRecord]:
+    """So many records from all over the board, others for every offset, so that repeated checks cover all."""
+    turns = max(1, -(-len(records) // count))
+    return list(records[offset % turns :: turns])
+
+
 def check_records(
     records: Sequence[ResultRecord],
     *,

@@ -26,12 +26,14 @@ than M3GN's (seeds and trajectories resampled). `m3gn-bench leaderboard check` r
 TRACKS = {
     "compact": "Small networks on the data of tier `paper`, each for the steps that it makes in ten minutes of one "
     "core of the machine that [pace.jsonl](plans/pace.jsonl) names ([plan](plans/compact.toml)). *Training* says how "
-    "many minutes of one core they took where they were made; *by the clock*: the budget was minutes of that machine.",
+    "many minutes of one core they took where they were made, or of another device that is named (for some seeds of a "
+    "row: the steps are the same anywhere); *by the clock*: the budget was minutes of that machine.",
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, for as long as one core allowed ([plan](plans/paper.toml)): "
     "not the paper's training, which took days on a GPU.",
     "tuning": "Trials of learning rates for the compact presets, on the *validation* split "
     "([plan](plans/tuning.toml)).",
+    "noise": "Trials of the compact MeshGraphNets' input noise, on the *validation* split ([plan](plans/noise.toml)).",
     "smoke": "A few steps on a few trajectories, which `m3gn-bench leaderboard check` trains again "
     "([plan](plans/smoke.toml)). Says nothing about the models.",
 }
@@ -114,8 +116,8 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
     lines = [
         "### Time per prediction",
         "",
-        "Milliseconds for a trajectory, mean over context sizes; one thread of a CPU, batches of four, while a campaign's "
-        "other processes have the other cores. Empty where all of a method's seeds were scored on a GPU.",
+        "Milliseconds for a trajectory, mean over context sizes; one thread of a CPU, batches of four, while a "
+        "campaign's other processes have the other cores. Empty where all seeds were scored on a GPU.",
         "",
         _row(["model", *(shown[name] for name in boards)]),
         _row(["---", *("--:" for _ in boards)]),
@@ -130,6 +132,9 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
 def _cells(row: Entry, contexts: Sequence[int], m3gn: Entry | None) -> Iterable[str]:
     minutes = row.training_minutes
     training = f"{minutes:.0f} min, {row.training_steps:.0f} steps" if minutes else "none"
+    others = sorted({record.checkpoint.device for record in row.records} - {"cpu"})
+    if others and minutes:
+        training += f" ({', '.join(others)})"
     if any(record.checkpoint.config.training.get("minutes") for record in row.records):
         training += " (by the clock)"
     yield from (row.label, str(row.seeds), f"{row.parameters:,}".replace(",", " "), training)

@@ -207,6 +207,20 @@ def test_the_command_fails_where_a_record_does(
     assert ["no record" in problem for problem in outcome["problems"]] == [True] * planted
 
 
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 99])
+def test_repeated_checks_sample_every_record(count: int) -> None:
+    """At most so many at a time, of several tasks where there are several, and none left out by all."""
+    records = [r for r in read_records() if r.ships]
+    turns = -(-len(records) // count)
+    samples = [check.sample(records, count, offset) for offset in range(739_000, 739_000 + turns)]
+    assert all(0 < len(chosen) <= count for chosen in samples)
+    assert sorted(r.task + r.name for chosen in samples for r in chosen) == sorted(
+        r.task + r.name for r in records
+    )
+    if count == 12:
+        assert all(len({r.task for r in chosen}) >= 4 for chosen in samples)
+
+
 def test_missing_checkpoint_and_empty_board_are_problems(
     use_board: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
