@@ -362,8 +362,8 @@ def campaign(
     from m3gn_bench.training import usable_device
 
     report = Report(as_json)
-    parse_executor(executor)
-    usable_device(device)
+    if parse_executor(executor).kind == "process":  # a cluster's workers may have what its head has not
+        usable_device(device)
     planned = read_plan(plan)
     versions = {run.task: dataset_version(get_task(run.task)) for run in planned}
     records = read_records(home)
