@@ -1,13 +1,17 @@
 """What `benchmarks` compares computes the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from model_cases import make_case, training_cases
+from primitives_fit import fit_error
 from training_step import loss, pair_of_models, time_steps
 from usual_m3gn import PlainM3GN
 
 from m3gn_bench.m3gn import M3GN
+from m3gn_bench.movement_primitives import ProDMP
 from m3gn_bench.tasks import get_task
 
 WITHOUT_AND_WITH_COLLIDER = ("sheet_deformation", "deformable_block")
@@ -64,3 +68,27 @@ def test_both_take_the_same_training_steps() -> None:
     step = float((after[0] - before).abs().max())
     assert step > 0
     assert float((after[1] - after[0]).abs().max()) < 0.01 * step
+
+
+@pytest.mark.parametrize("context", [2, 5])
+def test_fitted_primitives_find_what_primitives_made(context: int) -> None:
+    """But for float32's rounding; and of noise they leave the share that they have no parameters for."""
+    case, tau, functions = make_case("falling_teddy", 3), 0.7, 8
+    primitives = ProDMP(functions)
+    steps, unit = case.frames - context, case.frames - 1
+    responses = primitives.responses(torch.arange(1, steps + 1) / unit, torch.tensor([tau]))[0]
+    anchor = case.positions[context - 1]
+    velocity = (anchor - case.positions[context - 2]) * unit
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(*anchor.shape, functions + 1, generator=generator)
+    made = anchor + primitives.movement(responses, weights, velocity)
+
+    def error(future: torch.Tensor) -> float:
+        positions = torch.cat([case.positions[:context], future])
+        return fit_error(primitives, replace(case, positions=positions), context, tau)
+
+    moved = float((made - anchor).square().mean())
+    assert error(made) < 1e-10 * moved
+    noise = 0.1 * torch.randn(made.shape, generator=generator)
+    left = (steps - functions - 1) / steps * float(noise.square().mean())
+    assert error(made + noise) == pytest.approx(left, rel=0.1)
