@@ -35,7 +35,9 @@ same machine). Where a finding says "no better" or "as good as", errors count as
 some hundred comparisons on this page one or two may come out by chance. A finding is *reproduced* if all its
 comparisons hold, and *not reproduced* if all are contradicted. Networks here are small and trained for minutes on a
 CPU ([plans](plans)), and data are our own simulations: a finding that does not appear here may still hold for the
-paper's networks and data.
+paper's networks and data. Every method had the same trials of its learning rate ([plan](plans/tuning.toml)), but not
+all had others: MeshGraphNets had eight of their noise ([plan](plans/noise.toml)), and how many context pairs M3GN reads
+per step comes from [experiments](../docs/performance.md) that other methods did not get.
 """
 
 

@@ -31,7 +31,8 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     if record.dataset_version.startswith(IMPORTED):
         problems.append("it was scored on imported data, but boards are of the benchmark's own")
         return Verdict(problems=tuple(problems), remarks=())
-    if record.split != "test" and record.track != "tuning":
+    on_same_split = any((peer.track, peer.split) == (record.track, record.split) for peer in board)
+    if record.split != "test" and not on_same_split:  # tracks of trials are of the validation split
         problems.append(f"split is {record.split!r}, but boards are of the test split")
     if find_record(board, record.track, record.task, record.name) is not None and not replace:
         problems.append(

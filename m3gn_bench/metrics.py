@@ -6,6 +6,7 @@ section 5: full-rollout MSE and per-timestep MSE).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -86,14 +87,19 @@ def bootstrap_means(errors: Sequence[np.ndarray], *, same_runs: bool = False) ->
     Returns:
         Shape [models, BOOTSTRAP_RESAMPLES].
     """
+    counts = tuple(len(row) for row in (errors[:1] if same_runs else errors))
+    trajectories, seeds = _shares(errors[0].shape[1], counts)
+    if same_runs:
+        seeds = seeds * len(errors)
+    return np.stack([((trajectories @ e.T) * s).sum(1) for s, e in zip(seeds, errors, strict=True)])
+
+
+@lru_cache(maxsize=8)  # drawing takes longer than all that is done with it
+def _shares(trajectories: int, seeds: tuple[int, ...]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Of every trajectory, and of every seed of each model, in the means of all resamples."""
     rng = np.random.default_rng(0)
 
     def shares(items: int, drawn: int) -> np.ndarray:
         return rng.multinomial(drawn, np.full(items, 1 / items), BOOTSTRAP_RESAMPLES) / drawn
 
-    def shares_of_seeds(row: np.ndarray) -> np.ndarray:
-        return shares(len(row), max(1, len(row) - 1))
-
-    trajectories = shares(errors[0].shape[1], errors[0].shape[1])
-    seeds = [shares_of_seeds(errors[0])] * len(errors) if same_runs else [shares_of_seeds(e) for e in errors]
-    return np.stack([((s @ e) * trajectories).sum(1) for s, e in zip(seeds, errors, strict=True)])
+    return shares(trajectories, trajectories), tuple(shares(count, max(1, count - 1)) for count in seeds)

@@ -10,16 +10,17 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from m3gn_bench.baselines.mgn import MeshGraphNet
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cli import run
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.campaign import PLANS, Job, Outcome, carry_out, read_plan
 from m3gn_bench.leaderboard.check import compare_with_retrained
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
+from m3gn_bench.m3gn import M3GN
 from m3gn_bench.model import load_preset
 from m3gn_bench.tasks import TASKS
 
@@ -28,7 +29,7 @@ HEAD = 'track = "trial"\ntier = "smoke"\n'
 GRID = """
 [[runs]]
 tasks = ["sheet_deformation"]
-models = ["mgn"]
+models = ["m3gn"]
 preset = "smoke"
 steps = 3
 """
@@ -69,12 +70,12 @@ def test_a_plan_is_carried_out_once(
     assert (code, after["counts"]) == (0, {"done": 3, "outdated": 0, "to do": 0})
     home = tmp_path / "home"
     records = {record.name: record for record in read_records(home)}
-    assert set(records) == {"mgn-smoke-s0", "mgn-smoke-s1", "mgn-smoke-hasty-s0"}
-    assert len(records["mgn-smoke-s0"].keys) == 3  # of four test trajectories one is of 100 MPa
-    assert records["mgn-smoke-hasty-s0"].checkpoint.config.training["learning_rate"] == 0.01
-    assert [name for name, record in records.items() if record.ships] == ["mgn-smoke-s1"]
-    _, shipped = load_checkpoint(checkpoint_folder("sheet_deformation", "mgn", "smoke", 1, home))
-    assert shipped == records["mgn-smoke-s1"].checkpoint
+    assert set(records) == {"m3gn-smoke-s0", "m3gn-smoke-s1", "m3gn-smoke-hasty-s0"}
+    assert len(records["m3gn-smoke-s0"].keys) == 3  # of four test trajectories one is of 100 MPa
+    assert records["m3gn-smoke-hasty-s0"].checkpoint.config.training["learning_rate"] == 0.01
+    assert [name for name, record in records.items() if record.ships] == ["m3gn-smoke-s1"]
+    _, shipped = load_checkpoint(checkpoint_folder("sheet_deformation", "m3gn", "smoke", 1, home))
+    assert shipped == records["m3gn-smoke-s1"].checkpoint
 
     written = {path: path.stat().st_mtime_ns for path in home.rglob("*") if path.is_file()}
     carry(command, capsys)
@@ -84,7 +85,7 @@ def test_a_plan_is_carried_out_once(
     _, changed = carry([*command, "--status"], capsys)
     assert changed["counts"] == {"done": 0, "outdated": 1, "to do": 0}
     carry(command, capsys)
-    again = next(record for record in read_records(home) if record.name == "mgn-smoke-s0")
+    again = next(record for record in read_records(home) if record.name == "m3gn-smoke-s0")
     assert again.checkpoint.steps == 2
 
 
@@ -97,15 +98,25 @@ def test_a_failing_run_does_not_stop_the_others(
     assert code == 1
     assert outcome["counts"] == {"done": 1, "outdated": 0, "to do": 1}
     ((name, problem),) = outcome["problems"].items()  # type: ignore[attr-defined]
-    assert name == "sheet_deformation/mgn-smoke-wild-s0"
+    assert name == "sheet_deformation/m3gn-smoke-wild-s0"
     assert "learning_rate" in problem
+
+
+def test_a_device_that_is_not_there_stops_a_campaign_at_once(
+    smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(campaign(write(tmp_path, GRID), smoke_file.parent, "--device", "cuda:99"))
+    assert stop.value.code == 2
+    assert "device 'cuda:99' cannot be used" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_defect_of_one_run_is_told_and_not_in_the_way(
     smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (planned,) = read_plan(write(tmp_path, GRID))
-    monkeypatch.setattr(MeshGraphNet, "training_loss", lambda self, case, rng: 1 / 0)
+    monkeypatch.setattr(M3GN, "training_loss", lambda self, case, rng: 1 / 0)
     outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
     assert outcome.record is None
     assert "ZeroDivisionError" in str(outcome.error)
@@ -116,7 +127,7 @@ def test_shipping_later_is_something_to_do(
 ) -> None:
     """The training is not done again, but its checkpoint comes to lie beside the record."""
     carry(campaign(write(tmp_path, GRID), smoke_file.parent), capsys)
-    folder = checkpoint_folder("sheet_deformation", "mgn", "smoke", 0, tmp_path / "home")
+    folder = checkpoint_folder("sheet_deformation", "m3gn", "smoke", 0, tmp_path / "home")
     assert not folder.exists()
     trained = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("weights.safetensors")}
     plan = write(tmp_path, GRID + "shipped_seeds = [0]\n")
@@ -159,14 +170,14 @@ def test_a_killed_campaign_goes_on(
     assert not _alive(process.pid)
     assert carry(campaign(plan, smoke_file.parent), capsys)[0] == 0
     assert all(path.stat().st_mtime_ns == time for path, time in finished.items())
-    undisturbed = tmp_path / "undisturbed"
-    undisturbed.mkdir()
-    carry(campaign(write(undisturbed, grid), smoke_file.parent), capsys)
 
-    def errors(home: Path) -> dict[str, object]:
-        return {r.name: [x.trajectory_mse for x in r.results] for r in read_records(home)}
-
-    assert errors(tmp_path / "home") == errors(undisturbed / "home")
+    found = {record.name: record for record in read_records(tmp_path / "home")}
+    assert len(found) == 3
+    for planned in read_plan(plan):
+        undisturbed = carry_out(Job(planned, smoke_file, tmp_path / "undisturbed")).record
+        assert undisturbed is not None
+        for one, other in zip(found[planned.name].results, undisturbed.results, strict=True):
+            assert np.allclose(one.trajectory_mse, other.trajectory_mse, rtol=1e-7)  # records are rounded
 
 
 def _alive(session: int) -> bool:
@@ -184,7 +195,7 @@ def _alive(session: int) -> bool:
         ("track = ", "cannot read"),
         (HEAD, "runs"),
         (HEAD + GRID + "minute = 3\n", r"runs.0.minute"),
-        (HEAD + GRID.replace("mgn", "magnet"), "unknown model 'magnet'"),
+        (HEAD + GRID.replace("m3gn", "magnet"), "unknown model 'magnet'"),
         (HEAD + GRID.replace("sheet_deformation", "sheet"), "table 1: unknown task 'sheet'"),
         (HEAD + GRID.replace("steps = 3", ""), "give a budget"),
         (HEAD + GRID + "minutes = 3\n", "give a budget"),
@@ -236,7 +247,7 @@ def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
     ]
     path = tmp_path / "pace.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    grid = GRID.replace('["mgn"]', '["mgn", "m3gn"]').replace("steps = 3", "minutes = 2")
+    grid = GRID.replace('["m3gn"]', '["mgn", "m3gn"]').replace("steps = 3", "minutes = 2")
     plan = write(tmp_path, grid, head=HEAD + 'pace = "pace.jsonl"\n')
     found = {run.config.model_name: run.config.training for run in read_plan(plan)}
     assert {name: (budget.steps, budget.minutes) for name, budget in found.items()} == {
@@ -312,10 +323,8 @@ def test_planted_error_in_training_is_found(
     assert same.ok
     assert all(c.relative_difference == 0 and c.same_trajectory for c in same.compared)
 
-    original = MeshGraphNet.training_loss
-    monkeypatch.setattr(
-        MeshGraphNet, "training_loss", lambda self, case, rng: original(self, case, rng).sqrt()
-    )
+    original = M3GN.training_loss
+    monkeypatch.setattr(M3GN, "training_loss", lambda self, case, rng: original(self, case, rng).sqrt())
     assert not compare_with_retrained([recorded], [trained("third")]).ok
 
     def problem(record: ResultRecord | None, outcome: Outcome) -> str:

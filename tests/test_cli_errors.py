@@ -305,6 +305,7 @@ def test_damaged_checkpoints(
         (["--contexts", "a,b"], ["--contexts 'a,b' is no list of numbers"]),
         (["--contexts", ""], ["--contexts '' is no list of numbers"]),
         (["--tier", "huge"], ["tier 'huge'", "known: paper, quick, smoke"]),
+        (["--device", "cuda:99"], ["device 'cuda:99' cannot be used"]),
     ],
     ids=lambda value: " ".join(value) if "--" in value[0] else None,
 )

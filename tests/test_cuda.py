@@ -16,20 +16,18 @@ from m3gn_bench.training import train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 KINDS = ["sheet_deformation", "tissue_manipulation", "falling_teddy"]
-LEARNED = [
-    name
-    for name in model_names()
-    if build_model(load_preset(name, "smoke", get_task(KINDS[0])), get_task(KINDS[0])).is_learned
-]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", LEARNED)
+@pytest.mark.parametrize("name", model_names())
 def test_trains_to_the_same_weights(name: str, kind: str, tmp_path: Path) -> None:
     """Five steps, whose rounding no method can have amplified much."""
     task = get_task(kind)
     cases, held_out = ([make_case(kind, seed) for seed in seeds] for seeds in (range(4), range(10, 12)))
-    config = load_preset(name, "smoke", task, {"training.steps": 5, "training.validations": 1})
+    budget = {"training.steps": 5, "training.validations": 1}
+    config = load_preset(name, "smoke", task, budget)
+    if not build_model(config, task).is_learned:
+        pytest.skip(f"{name} does not learn")
     errors = {}
     for device in ("cpu", "cuda"):
         out = tmp_path / device

@@ -446,6 +446,14 @@ def test_a_board_compares_like_with_like(board: Path) -> None:
         summary.entries([one, other.model_copy(update={"tier": "quick"})], one.track, one.task)
 
 
+def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecord) -> None:
+    trial = submitted.model_copy(update={"track": "trials", "split": "validation"})
+    other = trial.model_copy(update={"seed": 1})
+    records = read_records(board)
+    assert any("boards are of the test split" in p for p in submission.review(trial, records).problems)
+    assert not any("split" in p for p in submission.review(trial, [*records, other]).problems)
+
+
 def test_a_submission_on_other_bits_or_by_an_unknown_model_is_remarked(
     board: Path, submitted: ResultRecord
 ) -> None:
