@@ -7,6 +7,8 @@ import pytest
 import torch
 from model_cases import make_case, training_cases
 from primitives_fit import fit_error
+from rigid_errors import PARTS, rigid_parts
+from scipy.spatial.transform import Rotation
 from training_step import loss, pair_of_models, time_steps
 from usual_m3gn import PlainM3GN
 
@@ -92,3 +94,23 @@ def test_fitted_primitives_find_what_primitives_made(context: int) -> None:
     noise = 0.1 * torch.randn(made.shape, generator=generator)
     left = (steps - functions - 1) / steps * float(noise.square().mean())
     assert error(made + noise) == pytest.approx(left, rel=0.1)
+
+
+def test_rigid_errors_are_told_apart() -> None:
+    """Shifted, turned about its middle or swollen: one part each; and the parts are the whole."""
+    rng = np.random.default_rng(0)
+    truth = rng.standard_normal((3, 20, 3))
+    middle = truth.mean(1, keepdims=True)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    wrong = {
+        "level": truth + np.array([0.3, 0.4, 0.0]),
+        "upright": truth + np.array([0.0, 0.0, 0.5]),
+        "turn": middle + turn.apply((truth - middle).reshape(-1, 3)).reshape(truth.shape),
+        "shape": middle + 1.1 * (truth - middle),
+    }
+    for part, predicted in wrong.items():
+        found = rigid_parts(predicted, truth)
+        assert found[part] == pytest.approx(np.square(predicted - truth).mean())
+        assert all(found[other] == pytest.approx(0, abs=1e-12) for other in PARTS if other != part)
+    anything = rng.standard_normal(truth.shape)
+    assert sum(rigid_parts(anything, truth).values()) == pytest.approx(np.square(anything - truth).mean())

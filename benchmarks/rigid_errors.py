@@ -1,0 +1,114 @@
+"""What predictions of falling bodies get wrong: where the body is, how it is turned, or what shape it has.
+
+An error is the sum of three parts: of the nodes' mean (level and upright); of the turn that brings the prediction
+closest to the truth about that mean; and what is left, the shape. The last row is no model: the same body simulated
+again, turned by a tenth of a degree before it is dropped. If that changes little, where a body goes can be predicted.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.cpu import use_cpu
+from m3gn_bench.data import Case, case_from, load_cases
+from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.generators.falling import FallParameters
+from m3gn_bench.generators.generate import draw
+from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.leaderboard.record import checkpoint_folder
+from m3gn_bench.model import build_model, load_preset
+from m3gn_bench.sources import find_or_generate
+from m3gn_bench.tasks import Task, get_task
+
+TURN = np.radians(0.1)
+PARTS = ("level", "upright", "turn", "shape")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", default="falling_teddy")
+    parser.add_argument(
+        "--models", default="m3gn,mgn,mango,egno,stand_still", help="that ship with the project"
+    )
+    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
+    parser.add_argument("--data", type=Path, default=Path("data"))
+    parser.add_argument("--tier", default="paper")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    use_cpu(1)
+
+    task = get_task(options.task)
+    context = task.context_sizes[len(task.context_sizes) // 2]
+    path = find_or_generate(task, options.tier, options.data, splits=("validation",))
+    cases = load_cases(path, task, "validation", options.tier)
+    chosen = [cases[int(i)] for i in np.linspace(0, len(cases) - 1, options.trajectories)]
+    rows = []
+    for name in options.models.split(","):
+        folder = checkpoint_folder(task.name, name, "compact")
+        untrained = build_model(load_preset(name, "compact", task), task)
+        model = load_checkpoint(folder, task)[0] if untrained.is_learned else untrained
+        model.eval()
+        with torch.inference_mode():
+            parts = [
+                rigid_parts(
+                    model.predict(case.context(context)).double().numpy(), case.future(context).numpy()
+                )
+                for case in chosen
+            ]
+        rows.append({"task": task.name, "context": context, "model": name} | mean_of(parts))
+    parts = [rigid_parts(turned(task, case)[context:], case.future(context).numpy()) for case in chosen]
+    rows.append({"task": task.name, "context": context, "model": "turned by 0.1 degrees"} | mean_of(parts))
+    if options.json:
+        print(json.dumps(rows))
+        return
+    for row in rows:
+        shares = ", ".join(f"{part} {row[part] * 1e3:.3g}" for part in PARTS)
+        print(
+            f"{row['task']}, context {row['context']}, {row['model']}: {row['mse'] * 1e3:.3g} x 1e-3 = {shares}"
+        )
+
+
+def turned(task: Task, case: Case) -> np.ndarray:
+    """The trajectory if the body were turned a little about a level axis at the start, shape [frames, nodes, 3]."""
+    (key,) = case.keys
+    scene, (split, index) = get_scene(task.scene), key.split("_")
+    parameters = draw(scene, split, int(index), DATASET_SEED)
+    assert isinstance(parameters, FallParameters)
+    orientation = Rotation.from_rotvec([TURN, 0, 0]) * Rotation.from_quat(parameters.orientation)
+    turned = replace(parameters, orientation=tuple(orientation.as_quat()))
+    return case_from(task, scene, scene.simulate(turned, "default"), key).positions.numpy()
+
+
+def mean_of(parts: list[dict[str, float]]) -> dict[str, float]:
+    """Means over trajectories, and their sum."""
+    means = {part: float(np.mean([one[part] for one in parts])) for part in PARTS}
+    return means | {"mse": sum(means.values())}
+
+
+def rigid_parts(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """The parts of the mean squared error per coordinate; gravity is along the last one.
+
+    Args:
+        predicted, truth: positions, shape [frames, nodes, 3].
+    """
+    offset = (predicted - truth).mean(1)
+    centred, wanted = (positions - positions.mean(1, keepdims=True) for positions in (predicted, truth))
+    turned = [Rotation.align_vectors(q, p)[0].apply(p) for p, q in zip(centred, wanted, strict=True)]
+    shape = np.square(np.array(turned) - wanted).mean()
+    return {
+        "level": float(np.square(offset[:, :2]).mean() * 2 / 3),
+        "upright": float(np.square(offset[:, 2]).mean() / 3),
+        "turn": float(np.square(centred - wanted).mean() - shape),
+        "shape": float(shape),
+    }
+
+
+if __name__ == "__main__":
+    main()
