@@ -9,9 +9,13 @@ from model_cases import make_case, training_cases
 from primitives_fit import fit_error
 from rigid_errors import PARTS, rigid_parts
 from scipy.spatial.transform import Rotation
+from toppling import level_paths, regression
 from training_step import loss, pair_of_models, time_steps
 from usual_m3gn import PlainM3GN
 
+from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.generators.generate import draw
+from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.movement_primitives import ProDMP
 from m3gn_bench.tasks import get_task
@@ -114,3 +118,22 @@ def test_rigid_errors_are_told_apart() -> None:
         assert all(found[other] == pytest.approx(0, abs=1e-12) for other in PARTS if other != part)
     anything = rng.standard_normal(truth.shape)
     assert sum(rigid_parts(anything, truth).values()) == pytest.approx(np.square(anything - truth).mean())
+
+
+def test_regression_finds_a_smooth_function() -> None:
+    inputs, asked = (np.linspace(0, 3, count)[:, None] for count in (30, 17))
+    outputs, wanted = (np.stack([np.sin(x), np.cos(x)], axis=1) for x in (inputs, asked))
+    assert np.allclose(regression(inputs, outputs, asked, 0.5, 1e-6), wanted, atol=1e-3)
+
+
+def test_bodies_turned_about_the_vertical_go_the_same_way_in_their_own_axes() -> None:
+    """Two drops that differ by such a turn, of a body without symmetry: the regression sees one."""
+    scene, task = get_scene("falling_teddy"), get_task("falling_teddy")
+    turn = Rotation.from_rotvec([0, 0, 1.1])
+    drop = draw(scene, "test", 0, DATASET_SEED)
+    turned = replace(drop, orientation=tuple((turn * Rotation.from_quat(drop.orientation)).as_quat()))
+    drops = [scene.simulate(parameters, "default") for parameters in (drop, turned)]
+    inputs, paths = level_paths(task, drops, 20)
+    assert np.allclose(inputs[0], inputs[1], atol=1e-6)
+    assert np.abs(paths[0]).max() > 0.1
+    assert np.allclose(paths[0], paths[1], atol=1e-3)
