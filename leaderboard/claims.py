@@ -36,8 +36,9 @@ some hundred comparisons on this page one or two may come out by chance. A findi
 comparisons hold, and *not reproduced* if all are contradicted. Networks here are small and trained for minutes on a
 CPU ([plans](plans)), and data are our own simulations: a finding that does not appear here may still hold for the
 paper's networks and data. Every method had the same trials of its learning rate ([plan](plans/tuning.toml)), but not
-all had others: MeshGraphNets had eight of their noise ([plan](plans/noise.toml)), and how many context pairs M3GN reads
-per step comes from [experiments](../docs/performance.md) that other methods did not get.
+all had others: MeshGraphNets had eight of their noise ([plan](plans/noise.toml)), M3GN four of the last movement as a
+feature on falling bodies ([plan](plans/falling.toml)), and how many context pairs it reads per step comes from
+[experiments](../docs/performance.md).
 """
 
 

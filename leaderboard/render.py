@@ -34,8 +34,8 @@ TRACKS = {
     "tuning": "Trials of learning rates for the compact presets, on the *validation* split "
     "([plan](plans/tuning.toml)).",
     "noise": "Trials of the compact MeshGraphNets' input noise, on the *validation* split ([plan](plans/noise.toml)).",
-    "reach": "More steps of message passing, or of training, on a falling body; on the *validation* split "
-    "([plan](plans/reach.toml)).",
+    "falling": "Trials of M3GN on falling bodies with and without the last movement, on the *validation* split "
+    "([plan](plans/falling.toml)).",
     "smoke": "A few steps on a few trajectories, which `m3gn-bench leaderboard check` trains again "
     "([plan](plans/smoke.toml)). Says nothing about the models.",
 }

@@ -22,7 +22,7 @@ from m3gn_bench.leaderboard.check import compare_with_retrained
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.model import load_preset
-from m3gn_bench.tasks import TASKS
+from m3gn_bench.tasks import TASKS, get_task
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
 HEAD = 'track = "trial"\ntier = "smoke"\n'
@@ -305,6 +305,19 @@ def test_presets_have_the_noise_of_the_trials() -> None:
             assert len(errors) == 2 or task.scene == "sheet_deformation"
             best = min(errors, key=lambda noise: errors[noise]) if errors else 1e-4
             assert load_preset(model, "compact", task).model.noise == best, (model, task.name)
+
+
+@pytest.mark.parametrize("name", ["falling_teddy", "mixed_objects"])
+def test_presets_have_the_history_of_the_trials(name: str) -> None:
+    errors = {
+        record.model == "m3gn_history": gmean([result.mse for result in record.results])
+        for record in read_records()
+        if record.track == "falling" and record.task == name and record.split == "validation"
+    }
+    assert len(errors) == 2
+    for model in ("m3gn", "m3gn_replan"):
+        config = load_preset(model, "compact", get_task(name)).model
+        assert config.model_dump()["history"] == min(errors, key=lambda history: errors[history])
 
 
 def test_planted_error_in_training_is_found(
