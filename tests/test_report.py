@@ -24,7 +24,7 @@ from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan
 from m3gn_bench.leaderboard.record import checkpoint_folder, read_records, write_record
 from m3gn_bench.leaderboard.site.board import board_rows
 from m3gn_bench.leaderboard.site.build import build
-from m3gn_bench.leaderboard.site.markdown import to_page
+from m3gn_bench.leaderboard.site.markdown import to_line, to_page
 from m3gn_bench.leaderboard.site.rollouts import (
     LARGEST,
     Rollouts,
@@ -286,6 +286,11 @@ def test_markdown_becomes_accessible_html() -> None:
     assert '<th scope="row">x</th>' in body
     assert 'class="verdict good">holds</td>' in body
     assert body.count("<thead>") == 1
+
+
+def test_a_line_has_no_links() -> None:
+    text = "As [pace.jsonl](plans/pace.jsonl) says ([plan](plans/a.toml)), *not* <b>."
+    assert to_line(text) == "As pace.jsonl says, <em>not</em> &lt;b&gt;."
 
 
 @pytest.mark.parametrize("missing", ["jinja2", "markdown_it", "matplotlib", "adjustText"])
