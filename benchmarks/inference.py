@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from inputs import add_dataset_options
 
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import load_cases
@@ -39,10 +40,8 @@ def main() -> None:
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--trajectories", type=int, default=None, help="default: all of the test split")
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--tier", default="paper")
     parser.add_argument("--state", type=Path, default=None, help="a file to go on from after an interruption")
-    parser.add_argument("--json", action="store_true")
+    add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(options.threads)
 

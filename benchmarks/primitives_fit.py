@@ -6,18 +6,16 @@ something else. All nodes share tau, and start with the velocity at the anchor, 
 
 import argparse
 import json
-from pathlib import Path
 
 import numpy as np
 import torch
+from inputs import add_dataset_options, spread_cases
 
 from m3gn_bench.cpu import use_cpu
-from m3gn_bench.data import Case, case_from
-from m3gn_bench.datasets.reader import TrajectoryDataset
+from m3gn_bench.data import Case
 from m3gn_bench.m3gn import PrimitivesConfig
 from m3gn_bench.model import load_preset
 from m3gn_bench.movement_primitives import ProDMP
-from m3gn_bench.sources import find_or_generate
 from m3gn_bench.tasks import get_task
 
 TAUS = (0.4, 0.5, 0.7, 1.0, 1.65)
@@ -29,17 +27,12 @@ def main() -> None:
     parser.add_argument("--task", default="falling_teddy")
     parser.add_argument("--preset", default="compact")
     parser.add_argument("--trajectories", type=int, default=20, help="spread over the test split")
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--tier", default="paper")
-    parser.add_argument("--json", action="store_true")
+    add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(1)
 
     task = get_task(options.task)
-    path = find_or_generate(task, options.tier, options.data, splits=("test",))
-    dataset = TrajectoryDataset(path, task.name, "test", options.tier)
-    chosen = np.linspace(0, len(dataset) - 1, options.trajectories).astype(int)
-    cases = [case_from(task, dataset.metadata, dataset[int(i)], dataset.keys[int(i)]) for i in chosen]
+    cases = spread_cases(task, "test", options)
     config = load_preset("m3gn", options.preset, task).model
     assert isinstance(config, PrimitivesConfig)
     primitives = ProDMP(config.basis_functions, config.alpha, config.alpha_x)

@@ -8,22 +8,21 @@ again, turned by a tenth of a degree before it is dropped. If that changes littl
 import argparse
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
+from inputs import add_dataset_options, spread_cases
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cpu import use_cpu
-from m3gn_bench.data import Case, case_from, load_cases
-from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.data import Case, case_from
+from m3gn_bench.datasets.schema import DATASET_SEED, parse_key
 from m3gn_bench.generators.falling import FallParameters
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.leaderboard.record import checkpoint_folder
-from m3gn_bench.model import build_model, load_preset
-from m3gn_bench.sources import find_or_generate
+from m3gn_bench.leaderboard.summary import middle
 from m3gn_bench.tasks import Task, get_task
 
 TURN = np.radians(0.1)
@@ -38,32 +37,25 @@ def main() -> None:
         "--models", default="m3gn,mgn,mango,egno,stand_still", help="that ship with the project"
     )
     parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--tier", default="paper")
-    parser.add_argument("--json", action="store_true")
+    add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(1)
 
     task = get_task(options.task)
-    context = task.context_sizes[len(task.context_sizes) // 2]
-    path = find_or_generate(task, options.tier, options.data, splits=("validation",))
-    cases = load_cases(path, task, "validation", options.tier)
-    chosen = [cases[int(i)] for i in np.linspace(0, len(cases) - 1, options.trajectories)]
+    context = middle(task.context_sizes)
+    cases = spread_cases(task, "validation", options)
     rows = []
     for name in options.models.split(","):
-        folder = checkpoint_folder(task.name, name, "compact")
-        untrained = build_model(load_preset(name, "compact", task), task)
-        model = load_checkpoint(folder, task)[0] if untrained.is_learned else untrained
-        model.eval()
+        model, _ = load_checkpoint(checkpoint_folder(task.name, name, "compact"), task)
         with torch.inference_mode():
             parts = [
                 rigid_parts(
                     model.predict(case.context(context)).double().numpy(), case.future(context).numpy()
                 )
-                for case in chosen
+                for case in cases
             ]
         rows.append({"task": task.name, "context": context, "model": name} | mean_of(parts))
-    parts = [rigid_parts(turned(task, case)[context:], case.future(context).numpy()) for case in chosen]
+    parts = [rigid_parts(turned(task, case)[context:], case.future(context).numpy()) for case in cases]
     rows.append({"task": task.name, "context": context, "model": "turned by 0.1 degrees"} | mean_of(parts))
     if options.json:
         print(json.dumps(rows))
@@ -78,12 +70,12 @@ def main() -> None:
 def turned(task: Task, case: Case) -> np.ndarray:
     """The trajectory if the body were turned a little about a level axis at the start, shape [frames, nodes, 3]."""
     (key,) = case.keys
-    scene, (split, index) = get_scene(task.scene), key.split("_")
-    parameters = draw(scene, split, int(index), DATASET_SEED)
+    scene = get_scene(task.scene)
+    parameters = draw(scene, *parse_key(key), DATASET_SEED)
     assert isinstance(parameters, FallParameters)
     orientation = Rotation.from_rotvec([TURN, 0, 0]) * Rotation.from_quat(parameters.orientation)
-    turned = replace(parameters, orientation=tuple(orientation.as_quat()))
-    return case_from(task, scene, scene.simulate(turned, "default"), key).positions.numpy()
+    drop = replace(parameters, orientation=tuple(orientation.as_quat()))
+    return case_from(task, scene, scene.simulate(drop, "default"), key).positions.numpy()
 
 
 def mean_of(parts: list[dict[str, float]]) -> dict[str, float]:
@@ -100,8 +92,8 @@ def rigid_parts(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """
     offset = (predicted - truth).mean(1)
     centred, wanted = (positions - positions.mean(1, keepdims=True) for positions in (predicted, truth))
-    turned = [Rotation.align_vectors(q, p)[0].apply(p) for p, q in zip(centred, wanted, strict=True)]
-    shape = np.square(np.array(turned) - wanted).mean()
+    aligned = [Rotation.align_vectors(q, p)[0].apply(p) for p, q in zip(centred, wanted, strict=True)]
+    shape = np.square(np.array(aligned) - wanted).mean()
     return {
         "level": float(np.square(offset[:, :2]).mean() * 2 / 3),
         "upright": float(np.square(offset[:, 2]).mean() / 3),

@@ -3,16 +3,16 @@
 A body that falls from rest does the same again, turned about the vertical, if it is turned about the vertical. So its
 level path, seen in its own axes, is a function of where "up" is in these axes, and of the material: four numbers.
 Kernel ridge regression on the training split says how much of the path they explain. It is no model of the benchmark,
-which are not told how a body was turned; it shows that the data suffice.
+whose models are not told how a body was turned; it shows that the data suffice.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 
 import numpy as np
+from inputs import add_dataset_options
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -21,6 +21,7 @@ from m3gn_bench.cpu import use_cpu
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.leaderboard.summary import middle
 from m3gn_bench.sources import find_or_generate
 from m3gn_bench.tasks import Task, get_task
 
@@ -32,14 +33,12 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="falling_teddy", help="of a single object")
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--tier", default="paper")
-    parser.add_argument("--json", action="store_true")
+    add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(1)
 
     task = get_task(options.task)
-    context = task.context_sizes[len(task.context_sizes) // 2]
+    context = middle(task.context_sizes)
     path = find_or_generate(task, options.tier, options.data, splits=("train", "validation"))
     (inputs, paths), (asked, wanted) = (
         level_paths(task, TrajectoryDataset(path, task.name, split, options.tier), context)
