@@ -32,6 +32,41 @@ class ConstantVelocity(Model):
         return context.positions[-1] + steps * (context.positions[-1] - context.positions[-2])
 
 
+class ScaledVelocity(Model):
+    """Every node goes on along its last movement, as far as a function of time says that is the same for all.
+
+    Attributes:
+        factors: multiples of the last movement that fit the training data best, by anchor and by predicted frame,
+            both counted from 0; shape [frames, frames], zero where there is nothing to predict.
+    """
+
+    factors: Tensor
+
+    def __init__(self, task: Task, config: ModelConfig) -> None:
+        super().__init__(task, config)
+        self.register_buffer("factors", torch.zeros(task.frames, task.frames))
+
+    def prepare(self, cases: Sequence[Case]) -> None:
+        """Least squares for every anchor and frame, in which all trajectories count alike."""
+        super().prepare(cases)
+        # All that least squares needs are scalar products of displacements since the first frame.
+        products = np.zeros(self.factors.shape)
+        for case in cases:
+            moved = (case.positions - case.positions[0]).flatten(1).numpy().astype(np.float64)
+            products += moved @ moved.T / moved.shape[1]
+        with_velocity = np.diff(products, axis=0)  # row t: products with the movement from t to t + 1
+        for anchor, with_all in enumerate(with_velocity, start=1):
+            square = with_all[anchor] - with_all[anchor - 1]
+            if square > 0:
+                factors = (with_all[anchor + 1 :] - with_all[anchor]) / square
+                self.factors[anchor, anchor + 1 :] = torch.from_numpy(factors)
+
+    def predict(self, context: Context) -> Tensor:
+        """The anchor plus multiples of the last movement, shape [horizon, nodes, dim]."""
+        factors = self.factors[context.size - 1, context.size :, None, None]
+        return context.positions[-1] + factors * (context.positions[-1] - context.positions[-2])
+
+
 def mesh_fingerprints(body: Body) -> list[int]:
     """A number for the mesh of each body: the same edges between the same nodes give the same number."""
     counts = torch.bincount(body.body_of_node[body.edges[0]], minlength=len(body.node_counts)).tolist()

@@ -390,6 +390,35 @@ several_meshes = [(seed, 4 + seed % 2) for seed in range(6)]
 
 
 @every_task
+def test_scaled_velocity_is_a_fit_by_least_squares(kind: str) -> None:
+    """Against numpy's, on the coordinates of all trajectories."""
+    cases = [make_case(kind, seed, size=4) for seed in range(5)]
+    new = make_case(kind, 7, size=5)
+    model = build("scaled_velocity", kind, cases)
+    for size in (2, 8):
+        paths = np.concatenate([case.positions.double().flatten(1).numpy() for case in cases], axis=1)
+        velocity, moved = paths[size - 1] - paths[size - 2], paths[size:] - paths[size - 1]
+        factors = np.linalg.lstsq(velocity[:, None], moved.T, rcond=None)[0][0]
+        anchor, before = new.positions[size - 1].numpy(), new.positions[size - 2].numpy()
+        expected = anchor + factors[:, None, None] * (anchor - before)
+        np.testing.assert_allclose(predict(model, new, size).numpy(), expected, atol=1e-5)
+
+
+def test_scaled_velocity_is_exact_where_all_follow_one_law_and_stands_still_where_all_rest() -> None:
+    kind = "sheet_deformation"
+    times = torch.linspace(0, 1, get_task(kind).frames, dtype=torch.float64)[:, None, None]
+    cases = []
+    for seed in range(3):
+        case = make_case(kind, seed)
+        direction = case.positions[-1] - case.positions[0]
+        cases.append(replace(case, positions=(case.positions[0] + times.sqrt() * direction).float()))
+    model = build("scaled_velocity", kind, cases[:2])
+    torch.testing.assert_close(predict(model, cases[2], 5), cases[2].future(5), atol=1e-5, rtol=0)
+    resting = [replace(case, positions=case.positions[:1].expand_as(case.positions)) for case in cases]
+    assert torch.equal(predict(build("scaled_velocity", kind, resting), cases[2], 5)[-1], cases[2].positions[4])
+
+
+@every_task
 def test_mean_trajectory_is_the_mean_on_the_same_mesh(kind: str) -> None:
     cases = [make_case(kind, seed, size=size) for seed, size in several_meshes]
     new = [make_case(kind, 7, size=5), make_case(kind, 8)]

@@ -42,6 +42,7 @@ PLACES = dict(zip(TASKS, (0, 0, 1, 2, 3, 3), strict=True))
 FRAMES_READ = {
     "stand_still": 1,
     "constant_velocity": 2,
+    "scaled_velocity": 2,
     "mean_trajectory": 1,
     "mgn": 3,
     "mgn_material": 3,
@@ -52,7 +53,7 @@ FRAMES_READ = {
 }
 TOLD_MATERIAL = {"mgn_material"}
 OBSERVING_NOISE = {"m3gn_noise_5e-4", "m3gn_noise_1e-3", "m3gn_noise_1e-2"}  # it belongs to place and number
-ROTATION_EQUIVARIANT = {"egno", "stand_still", "constant_velocity"}
+ROTATION_EQUIVARIANT = {"egno", "stand_still", "constant_velocity", "scaled_velocity"}
 REMEMBERING = {"mean_trajectory", "nearest_neighbour"}  # compare with the training data node by node
 
 LEARNED = [
