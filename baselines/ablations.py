@@ -8,8 +8,11 @@
 - Past movements among the simulator's inputs, or not: `M3GNWithHistory`, `M3GNWithoutHistory`,
   `MeshGraphNetWithoutHistory`.
 - Noisy observations: `M3GNNoise5e4`, `M3GNNoise1e3`, `M3GNNoise1e2`.
+
+And one of ours, which has one more part: `M3GNOnScaledVelocity`.
 """
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,9 +23,17 @@ from torch.nn import functional
 
 from m3gn_bench.baselines.mgn import MeshGraphNet, StepConfig, StepSimulator
 from m3gn_bench.baselines.spacetime import temporal_encoding
+from m3gn_bench.baselines.trivial import ScaledVelocity
 from m3gn_bench.data import Body, Case, Context
-from m3gn_bench.m3gn import M3GN, ContextConfig, ContextEncoder, PrimitivesConfig, TrajectorySimulator
-from m3gn_bench.model import Model, TrajectoryModel
+from m3gn_bench.m3gn import (
+    M3GN,
+    ContextConfig,
+    ContextEncoder,
+    M3GNConfig,
+    PrimitivesConfig,
+    TrajectorySimulator,
+)
+from m3gn_bench.model import Model, ModelConfig, TrajectoryModel
 from m3gn_bench.tasks import Task
 
 TRANSFORMER_SIZE, TRANSFORMER_BLOCKS, TRANSFORMER_HEADS = 32, 4, 4  # paper, section 5
@@ -305,6 +316,23 @@ class M3GNWithoutHistory(M3GN):
     """M3GN without past movements among the simulator's features: history length 0, on every task."""
 
     variant: ClassVar[dict[str, Any]] = {"history": False}
+
+
+class M3GNOnScaledVelocity(M3GN):
+    """M3GN predicts what `scaled_velocity` leaves; shows what is hard for it and what is not (not in the paper)."""
+
+    def __init__(self, task: Task, config: M3GNConfig) -> None:
+        super().__init__(task, config)
+        self.base = ScaledVelocity(task, ModelConfig())
+
+    def prepare(self, cases: Sequence[Case]) -> None:
+        """Take statistics from the training data, before the first step."""
+        super().prepare(cases)
+        self.base.prepare(cases)
+
+    def generate(self, context: Context, rng: np.random.Generator | None) -> Tensor:
+        """Positions after the anchor, shape [horizon, nodes, dim]."""
+        return self.base.predict(context) + (super().generate(context, rng) - context.positions[-1])
 
 
 class MeshGraphNetWithoutHistory(MeshGraphNet):

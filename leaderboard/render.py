@@ -36,6 +36,8 @@ TRACKS = {
     "noise": "Trials of the compact MeshGraphNets' input noise, on the *validation* split ([plan](plans/noise.toml)).",
     "falling": "Trials of M3GN on falling bodies with and without the last movement, on the *validation* split "
     "([plan](plans/falling.toml)).",
+    "sheet": "M3GN on Sheet Deformation, and the same on top of `scaled_velocity`, on the *validation* split "
+    "([plan](plans/sheet.toml)).",
     "smoke": "A few steps on a few trajectories, which `m3gn-bench leaderboard check` trains again "
     "([plan](plans/smoke.toml)). Says nothing about the models.",
 }

@@ -415,7 +415,9 @@ def test_scaled_velocity_is_exact_where_all_follow_one_law_and_stands_still_wher
     model = build("scaled_velocity", kind, cases[:2])
     torch.testing.assert_close(predict(model, cases[2], 5), cases[2].future(5), atol=1e-5, rtol=0)
     resting = [replace(case, positions=case.positions[:1].expand_as(case.positions)) for case in cases]
-    assert torch.equal(predict(build("scaled_velocity", kind, resting), cases[2], 5)[-1], cases[2].positions[4])
+    assert torch.equal(
+        predict(build("scaled_velocity", kind, resting), cases[2], 5)[-1], cases[2].positions[4]
+    )
 
 
 @every_task
