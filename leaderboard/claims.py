@@ -137,8 +137,8 @@ CLAIMS = (
         "On Tissue Manipulation the step-based models are ahead of M3GN",
         "section 6, main results, which has it as a slight lead",
         _on("compact", [TISSUE], "mgn", "m3gn") + _on("compact", [TISSUE], "mgn_material", "m3gn"),
-        "Here the tissue has no inertia and is pulled at a constant speed, so that nodes go on nearly as they moved last: "
-        "`scaled_velocity`, which learns one multiple of the last movement per frame, is far ahead of both, too.",
+        "Here the tissue has no inertia and is pulled at a constant speed, so that nodes go on nearly as they moved "
+        "last: `scaled_velocity`, which learns one multiple of the last movement per frame, is far ahead of both, too.",
     ),
     Claim(
         "M3GN is ahead of all baselines on Deformable Block",
@@ -150,9 +150,9 @@ CLAIMS = (
         "section 6, main results",
         _on("compact", [SHEET], "m3gn", "mgn", "mgn_material", "mango")
         + _on("compact", [SHEET], "egno", "mgn", "mgn_material", "mango"),
-        "EGNO is ahead of M3GN, and so is `scaled_velocity`, which learns one multiple of the last movement per frame: soon a "
-        "sheet's deflection grows as the cube root of the load, everywhere and whatever the material. M3GN on top of such "
-        "a multiple is level with EGNO: it lacks the form of the answer, not information "
+        "EGNO is ahead of M3GN, and so is `scaled_velocity`, which learns one multiple of the last movement per "
+        "frame: soon a sheet's deflection grows as the cube root of the load, everywhere and whatever the material. "
+        "M3GN on top of such a multiple is level with EGNO: it lacks the form of the answer, not information "
         "([experiments](../docs/performance.md)).",
     ),
     Claim(
@@ -177,8 +177,8 @@ CLAIMS = (
         "M3GN generalises to materials outside of the training range, where MGN and MaNGO fail to",
         "section 6, main results (Sheet Deformation, OOD)",
         _on("compact", [OOD], "m3gn", "mgn", "mgn_material", "mango"),
-        "From context 5 on materials hardly matter here, as `scaled_velocity` shows, whose predictions do not depend on them "
-        "([experiments](../docs/performance.md)).",
+        "From context 5 on materials hardly matter here, as `scaled_velocity` shows, whose predictions do not depend "
+        "on them ([experiments](../docs/performance.md)).",
     ),
     Claim(
         "Telling MGN the material helps on Deformable Block and Tissue Manipulation",
