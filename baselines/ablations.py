@@ -1,4 +1,4 @@
-"""M3GN with one part taken out or exchanged (paper, section 5, ablations).
+"""M3GN with one part taken out or exchanged (paper, section 4, ablations).
 
 - No context: `MeshGraphNetWithPrimitives`.
 - No trajectories but steps: `M3GNStep`.
@@ -36,7 +36,7 @@ from m3gn_bench.m3gn import (
 from m3gn_bench.model import Model, ModelConfig, TrajectoryModel
 from m3gn_bench.tasks import Task
 
-TRANSFORMER_SIZE, TRANSFORMER_BLOCKS, TRANSFORMER_HEADS = 32, 4, 4  # paper, section 5
+TRANSFORMER_SIZE, TRANSFORMER_BLOCKS, TRANSFORMER_HEADS = 32, 4, 4  # paper, section 4
 MINIMUM_VARIANCE = 1e-4  # of an observation of the task description, whose prior has variance 1
 
 

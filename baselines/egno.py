@@ -1,6 +1,6 @@
 """EGNO: equivariant message passing and convolutions in Fourier space over a fixed number of predicted steps.
 
-Xu et al. 2024 as the M3GN paper adapts it (section 5, appendix C). The anchor's state is repeated for every
+Xu et al. 2024 as the M3GN paper adapts it (section 4, appendix C). The anchor's state is repeated for every
 predicted step; each of the layers is, per time and with vectors r_ij = x_i - x_j,
 
     h <- h + act(K h),   (x - mean, v) <- (x - mean, v) + K' (x - mean, v),

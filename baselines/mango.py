@@ -1,6 +1,6 @@
 """MaNGO: message passing in space and convolutions over time, on the whole trajectory at once.
 
-Dahlinger et al. 2025 as the M3GN paper adapts it (section 5): its encoder of other trajectories is removed.
+Dahlinger et al. 2025 as the M3GN paper adapts it (section 4): its encoder of other trajectories is removed.
 Instead the input is a whole trajectory that consists of the context frames and then of the anchor, repeated to
 the end; what comes out for the context's frames is discarded. Each of the blocks is
 

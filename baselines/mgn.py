@@ -1,6 +1,6 @@
 """MeshGraphNets: predict each node's next movement, and feed the prediction back.
 
-Pfaff et al. 2020 as configured in the M3GN paper (section 5, appendix C): current and previous movement as
+Pfaff et al. 2020 as configured in the M3GN paper (section 4, appendix C): current and previous movement as
 node features, one-step loss, and random-walk noise on the training inputs (Sanchez-Gonzalez et al. 2020)
 with labels corrected so that the true next position stays the target. The collider's path is known: its nodes
 carry the movement that comes and the one before.

@@ -1,6 +1,6 @@
 """M3GN: infer the material from a few frames, then predict every node's whole trajectory at once.
 
-Paper, section 4. A context network reads every pair of consecutive context frames (graph at t, movement to
+Paper, section 3. A context network reads every pair of consecutive context frames (graph at t, movement to
 t + 1) and gives each node a latent vector per pair; their element-wise maximum over time is the node's task
 description z. A second network reads the anchor graph and z and gives each node the weights and goal of a
 movement primitive, whose time scale tau is shared by all nodes of a trajectory.

@@ -1,6 +1,6 @@
 """M3GN with re-planning: the horizon in segments, each a movement primitive of its own.
 
-The paper names the limit (section 6): smooth primitives over the whole horizon blur fast motion, and plan
+The paper names the limit (section 5): smooth primitives over the whole horizon blur fast motion, and plan
 without looking again. Here the task description z is inferred once, from the context; then the simulator
 predicts `segment` frames, looks at the graph that it predicted (with new contacts), and goes on from there.
 Every segment starts at the last predicted position with the velocity of the last predicted frames, which a

@@ -1,6 +1,6 @@
 """Message passing networks: embed, exchange messages along edges, read out per node.
 
-One block (paper, section 5 and table of hyper-parameters) is
+One block (paper, section 4 and table of hyper-parameters) is
 
     e <- LN(e + act(W_e [h_sender, h_receiver, e] + b_e)),
     h <- LN(h + act(W_h [h, mean of incoming e] + b_h)).

@@ -1,7 +1,7 @@
 """Errors of predicted trajectories, and their confidence intervals.
 
 All errors are mean squared errors per coordinate in scaled units, over the frames after the anchor (paper,
-section 5: full-rollout MSE and per-timestep MSE).
+section 4: full-rollout MSE and per-timestep MSE).
 """
 
 from collections.abc import Sequence
