@@ -37,7 +37,7 @@ comparisons hold, and *not reproduced* if all are contradicted. Networks here ar
 CPU ([plans](plans)), and data are our own simulations: a finding that does not appear here may still hold for the
 paper's networks and data. Every method of the compact track had the same trials of its learning rate
 ([plan](plans/tuning.toml)); ablations have the rates of what they are ablations of. Not all had others: MeshGraphNets
-had eight of their noise ([plan](plans/noise.toml)), M3GN four of the last movement as a feature on falling bodies
+had sixteen of their noise ([plan](plans/noise.toml)), M3GN four of the last movement as a feature on falling bodies
 ([plan](plans/falling.toml)), and how many context pairs it reads per step comes from
 [experiments](../docs/performance.md).
 """

@@ -292,7 +292,7 @@ def test_presets_have_the_rates_of_the_trials() -> None:
 
 
 def test_presets_have_the_noise_of_the_trials() -> None:
-    """The better of two, per task; a task without trials has what the paper has for Sheet Deformation."""
+    """The best, per scene, or what the paper has for Sheet Deformation where that is less than a quarter worse."""
     trials = [record for record in read_records() if record.track == "noise"]
     assert {record.split for record in trials} == {"validation"}
     for model in ("mgn", "mgn_material"):
@@ -300,11 +300,12 @@ def test_presets_have_the_noise_of_the_trials() -> None:
             errors = {
                 record.checkpoint.config.model["noise"]: gmean([result.mse for result in record.results])
                 for record in trials
-                if record.task == task.name
+                if record.task == task.scene
             }
-            assert len(errors) == 2 or task.scene == "sheet_deformation"
-            best = min(errors, key=lambda noise: errors[noise]) if errors else 1e-4
-            assert load_preset(model, "compact", task).model.noise == best, (model, task.name)
+            assert len(errors) >= 2
+            best = min(errors, key=lambda noise: errors[noise])
+            chosen = best if errors[best] * 1.25 <= errors[1e-4] else 1e-4
+            assert load_preset(model, "compact", task).model.noise == chosen, (model, task.name)
 
 
 @pytest.mark.parametrize("name", ["falling_teddy", "mixed_objects"])
