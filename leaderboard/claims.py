@@ -149,8 +149,8 @@ CLAIMS = (
         "section 4, main results, which has it as a slight lead",
         _on("compact", [TISSUE], "mgn", "m3gn") + _on("compact", [TISSUE], "mgn_material", "m3gn"),
         "Here the tissue has no inertia and is pulled at a constant speed, so that nodes go on nearly as they moved "
-        "last. Both MeshGraphNets are behind `constant_velocity`, which learns nothing, and still improve at the end of "
-        "their training: this says more of its length here than of the paper's finding.",
+        "last. Both MeshGraphNets are behind `constant_velocity`, which learns nothing, and still improve at the end "
+        "of their training: this says more of its length here than of the paper's finding.",
     ),
     Claim(
         "M3GN is ahead of all baselines on Deformable Block",
