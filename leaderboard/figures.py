@@ -22,6 +22,7 @@ STYLES = {
     "mgn_mp": ("C5", "X"),
     "stand_still": ("0.6", "."),
     "nearest_neighbour": ("0.3", "."),
+    "scaled_velocity": ("k", "."),
 }
 
 
