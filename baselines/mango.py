@@ -126,7 +126,7 @@ class MaNGO(TrajectoryModel):
         anchor = context.positions[-1]
         graph = build_graph(self.task, body, anchor[None], path[size - 1][None], _nothing(context))
         frames = torch.arange(context.frames, device=anchor.device)
-        times = time_embedding(frames, size - 1)
+        times = time_embedding(frames, size - 1).to(anchor.dtype)
         nodes = self.embed_nodes(self._node_inputs(context, times))
         some = edges_at_a_time(graph, context.frames, self.config.width)
         parts = graph.edge_features.split(some), self._edge_inputs(context, graph).split(some)

@@ -1,5 +1,6 @@
 """Every model on every kind of task: size, symmetries, no look into the future, batches, checkpoints."""
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -367,3 +368,24 @@ def test_damaged_checkpoints_are_refused(tmp_path: Path) -> None:
         load_checkpoint(tmp_path)
     with pytest.raises(CheckpointError, match="no checkpoint"):
         load_checkpoint(tmp_path / "nowhere")
+
+
+@exact_model
+def test_predicts_in_double_precision(name: str) -> None:
+    """What single precision says, more precisely; the studies of stability ask for it."""
+    kind = "deformable_block"
+    case = make_case(kind, 3)
+    single = build(name, kind, [case])
+    precise = copy.deepcopy(single).double()
+    body = replace(
+        case.body,
+        rest_positions=case.body.rest_positions.double(),
+        static_features=case.body.static_features.double(),
+        material=case.body.material.double(),
+    )
+    doubled = replace(
+        case, body=body, positions=case.positions.double(), collider_path=case.collider_path.double()
+    )
+    found = predict(precise, doubled, 8)
+    assert found.dtype == torch.float64
+    torch.testing.assert_close(found.float(), predict(single, case, 8), atol=1e-3, rtol=1e-3)
