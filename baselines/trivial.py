@@ -48,7 +48,6 @@ class ScaledVelocity(Model):
 
     def prepare(self, cases: Sequence[Case]) -> None:
         """Least squares for every anchor and frame, in which all trajectories count alike."""
-        super().prepare(cases)
         # All that least squares needs are scalar products of displacements since the first frame.
         products = np.zeros(self.factors.shape)
         for case in cases:
