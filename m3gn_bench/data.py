@@ -193,14 +193,18 @@ class Case:
         """The frames after a context of that size, shape [frames - size, nodes, dim]."""
         return self.positions[size:]
 
-    def to(self, device: torch.device) -> "Case":
-        """The same case on another device."""
+    def to(self, where: torch.device | torch.dtype) -> "Case":
+        """The same case on another device, or with its real numbers in another precision."""
+
+        def move(value: Tensor) -> Tensor:
+            real = value.is_floating_point()
+            return value.to(where) if real or isinstance(where, torch.device) else value
+
         values = {field.name: getattr(self.body, field.name) for field in fields(Body)}
         moved: dict[str, Any] = {
-            name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+            name: move(value) for name, value in values.items() if isinstance(value, Tensor)
         }
-        body = replace(self.body, **moved)
-        return Case(body, self.positions.to(device), self.collider_path.to(device), self.keys)
+        return Case(replace(self.body, **moved), move(self.positions), move(self.collider_path), self.keys)
 
 
 def join(cases: Sequence[Case]) -> Case:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from m3gn_bench.checkpoint import load_checkpoint, read_description
+from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cpu import use_cpu
-from m3gn_bench.data import Body, Case, Context, case_from
+from m3gn_bench.data import Case, Context, case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
 from m3gn_bench.provenance import machine
 from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
@@ -45,6 +45,7 @@ class Judged(Record):
         error: of a simulator against the finer simulation, of a model against the simulator; relative to the
             displacement or to the object's size (simulators), to the displacement after the anchor (models).
         detail: why it was refused, or is wrong; for models what was measured.
+        weights_sha256: of a model.
     """
 
     subject: str
@@ -52,6 +53,7 @@ class Judged(Record):
     verdict: Verdict
     error: float | None = None
     detail: str = ""
+    weights_sha256: str | None = None
 
 
 class Stability(Record):
@@ -115,7 +117,6 @@ def measure(
     )
     # Tasks that share a scene share its grid: it belongs to the one that bears its name.
     simulated = grid.cells if task.name == scene.name else ()
-    shas = {one: read_description(one.folder).weights_sha256[:8] for one in checkpoints}
     cells = [
         Cell(
             f"simulator: {one.name}",
@@ -125,7 +126,7 @@ def measure(
         for one in simulated
     ]
     cells += [
-        Cell(f"{one.folder} {shas[one]}: {name}", partial(_as_result, judge_model, task, one, name))
+        Cell(f"{one.key}: {name}", partial(_as_result, judge_model, task, one, name))
         for one in checkpoints
         for name in MODEL_CELLS
     ]
@@ -238,7 +239,7 @@ def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
     """Let a model predict under one extreme condition."""
     import torch
 
-    model, _ = load_checkpoint(checkpoint.folder)
+    model, description = load_checkpoint(checkpoint.folder)
     given = MODEL_CELLS[name](task)
     if given.context.positions.dtype == torch.float64:
         model.double()
@@ -257,6 +258,7 @@ def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
         verdict="bounded" if finite and furthest <= MODEL_BOUND else "wrong",
         error=error if finite else None,
         detail=f"at most {furthest:.3g} from the anchor",
+        weights_sha256=description.weights_sha256,
     )
 
 
@@ -279,8 +281,7 @@ def _given(case: Case, size: int, factor: float = 1.0, shift: float = 0.0) -> Gi
 
 def _map(case: Case, change: "Callable[[torch.Tensor], torch.Tensor]") -> Case:
     """The same case with all positions changed."""
-    values = {name: getattr(case.body, name) for name in Body.__dataclass_fields__}
-    body = Body(**{**values, "rest_positions": change(case.body.rest_positions)})
+    body = replace(case.body, rest_positions=change(case.body.rest_positions))
     return Case(body, change(case.positions), change(case.collider_path), case.keys)
 
 
@@ -300,12 +301,10 @@ def _longer(task: Task, factor: int) -> Given:
 
 def _double(task: Task) -> Given:
     """Everything in double precision."""
+    import torch
+
     case, size = _case(task), _middle(task)
-    precise = _map(case, lambda t: t.double())
-    values = {name: getattr(precise.body, name) for name in Body.__dataclass_fields__}
-    floats = {n: values[n].double() for n in ("static_features", "material")}
-    body = Body(**{**values, **floats})
-    return Given(replace(precise, body=body).context(size), case.future(size))
+    return Given(case.to(torch.float64).context(size), case.future(size))
 
 
 MODEL_CELLS: dict[str, Callable[[Task], Given]] = {

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from m3gn_bench.checkpoint import read_description
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.version import __version__
@@ -121,6 +122,11 @@ class Shipped:
     name: str
     preset: str
     folder: Path
+
+    @property
+    def key(self) -> str:
+        """Tells the same folder with other weights apart."""
+        return f"{self.folder} {read_description(self.folder).weights_sha256[:8]}"
 
 
 def distance(one: np.ndarray, other: np.ndarray) -> float:

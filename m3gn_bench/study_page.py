@@ -168,6 +168,7 @@ def _tradeoff(study: TradeOff) -> str:
         f"{study.machine}; dataset version {study.dataset_version}. "
         f"Clearly faster: by {100 * (study.time_margin - 1):.0f} %.",
         "",
+        *_weights((m.model, m.weights_sha256) for m in study.models),
         f"Meshes with cells of {', '.join(f'{size:.2g}' for size in convergence.cell_sizes)}: distances "
         f"{', '.join(_percent(d) for d in convergence.distances)}, order {order}, remaining error of the "
         f"reference {_percent(convergence.remaining)}.",
@@ -220,6 +221,7 @@ def _stability(study: Stability) -> str:
     lines = [
         f"### {TASKS[study.task].title} (dataset version {study.dataset_version})",
         "",
+        *_weights((c.subject, c.weights_sha256) for c in study.cells),
         _row(["", "cell", "verdict", "error", "detail"]),
         _row(["---", "---", "---", "--:", "---"]),
     ]
@@ -285,6 +287,12 @@ def draw(study: TradeOff) -> "Figure":
     # As many iterations everywhere: by default time is up after a second.
     adjust_text(labels, ax=axes, expand=(1.2, 2.0), iter_lim=100, arrowprops=line)
     return figure
+
+
+def _weights(models: Iterable[tuple[str, str | None]]) -> list[str]:
+    """A paragraph that tells which weights took part; none where no model did."""
+    named = dict.fromkeys(f"{name} {sha[:8]}" for name, sha in models if sha is not None)
+    return [f"SHA-256 of the models' weights: {', '.join(named)}.", ""] if named else []
 
 
 def _ways(study: TradeOff) -> tuple[Way, ...]:

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
-from m3gn_bench.checkpoint import load_checkpoint, read_description
+from m3gn_bench.checkpoint import Checkpoint, load_checkpoint, read_description
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
@@ -84,6 +84,7 @@ class Predicted(Record):
         error_to_data: distance from the dataset's trajectory, the default fidelity's.
         error_of_data: distance of that from the same judge, over the same frames.
         training_seconds: CPU seconds of training.
+        weights_sha256: what of the models of that name and preset took part.
         rival: the fastest simulator setting that is at least as accurate, if there is one; of those that count as
             equally fast, the first.
         pays_off_after: number of trajectories after which training has paid for itself against the rival;
@@ -99,6 +100,7 @@ class Predicted(Record):
     error_to_data: float
     error_of_data: float
     training_seconds: float
+    weights_sha256: str | None = None
     rival: str | None = None
     pays_off_after: int | None = None
     pays_off_with_data: int | None = None
@@ -244,7 +246,7 @@ def measure(
     )
     models = [
         _pay_off(
-            bench.predicted(results, one, context, 60 * description.minutes),
+            bench.predicted(results, one, context, description),
             bench.simulators(results, max(context, knobs.first)),
             data_seconds,
             knobs.time_margin,
@@ -560,7 +562,7 @@ class Bench:
         return total, distance(positions, companion) / unit, distance(companion, reference) / unit
 
     def predicted(
-        self, results: dict[str, Result], one: Shipped, context: int, training_seconds: float
+        self, results: dict[str, Result], one: Shipped, context: int, description: Checkpoint
     ) -> Predicted:
         """Means over draws of a model at a context size."""
         first = max(context, self.knobs.first)
@@ -586,7 +588,8 @@ class Bench:
             error=error,
             error_to_data=to_data,
             error_of_data=of_data,
-            training_seconds=training_seconds,
+            training_seconds=60 * description.minutes,
+            weights_sha256=description.weights_sha256,
         )
 
     def convergence(self, results: dict[str, Result]) -> Convergence:
@@ -633,13 +636,8 @@ def untimed(scene_name: str, parameters: Any, level: Any, frames: int, window: s
     return Result({}, {"positions": trajectory.positions[window]})
 
 
-def _model_name(one: Shipped) -> str:
-    """Tells the same folder with other weights apart."""
-    return f"{one.folder} {read_description(one.folder).weights_sha256[:8]}"
-
-
 def _prediction_name(one: Shipped, context: int, index: int) -> str:
-    return f"{_model_name(one)} {context} {index}"
+    return f"{one.key} {context} {index}"
 
 
 def _again_name(setting: "Setting", index: int, number: int) -> str:

@@ -377,15 +377,6 @@ def test_predicts_in_double_precision(name: str) -> None:
     case = make_case(kind, 3)
     single = build(name, kind, [case])
     precise = copy.deepcopy(single).double()
-    body = replace(
-        case.body,
-        rest_positions=case.body.rest_positions.double(),
-        static_features=case.body.static_features.double(),
-        material=case.body.material.double(),
-    )
-    doubled = replace(
-        case, body=body, positions=case.positions.double(), collider_path=case.collider_path.double()
-    )
-    found = predict(precise, doubled, 8)
+    found = predict(precise, case.to(torch.float64), 8)
     assert found.dtype == torch.float64
     torch.testing.assert_close(found.float(), predict(single, case, 8), atol=1e-3, rtol=1e-3)
