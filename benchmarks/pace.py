@@ -74,10 +74,11 @@ def main() -> None:
     part, parts = map(int, arguments.part.split("/"))
     models: dict[tuple[str, str], list[str]] = {}
     for path in arguments.plans:
-        for grid in Plan.model_validate(tomllib.loads(path.read_text())).runs:
+        plan = Plan.model_validate(tomllib.loads(path.read_text()))
+        for grid in plan.runs:
             for task in grid.tasks if grid.minutes is not None else ():
                 known = models.setdefault((grid.preset, task), [])
-                known += [model for model in grid.models if model not in known]
+                known += [model for model in grid.models if model not in known and model not in plan.pace_of]
     names = [{"preset": preset, "task": task} for preset, task in models]
     settings = {"models": models, "tier": arguments.tier, "data": arguments.data}
     run_missing(arguments.output, names[part - 1 :: parts], measure, **settings)

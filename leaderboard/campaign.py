@@ -6,6 +6,7 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
     tier = "paper"              # default
     split = "test"              # default; "validation" for trials of hyper-parameters
     pace = "pace.jsonl"         # a file beside the plan: minutes are those of its machine, as steps (`pace`)
+    pace_of = { mgn_no_history = "mgn" }  # models that take another's steps, because their network is the same
 
     [[runs]]
     tasks = ["deformable_block"]
@@ -77,6 +78,7 @@ class Plan(Record):
     tier: str = "paper"
     split: Split = "test"
     pace: str | None = None
+    pace_of: dict[str, str] = {}
     runs: tuple[Grid, ...] = Field(min_length=1)
 
 
@@ -151,7 +153,9 @@ def _planned(plan: Plan, pace: Pace | None, grid: Grid, task_name: str, model: s
     task = get_task(task_name)
     budget: dict[str, float | None] = {"training.minutes": grid.minutes, "training.steps": grid.steps}
     if pace is not None and grid.minutes is not None and grid.steps is None:
-        budget = {"training.steps": pace.steps(grid.preset, task_name, model, grid.minutes)}
+        budget = {
+            "training.steps": pace.steps(grid.preset, task_name, plan.pace_of.get(model, model), grid.minutes)
+        }
     settings = grid.settings | {key: value for key, value in budget.items() if value is not None}
     config = load_preset(model, grid.preset, task, settings)
     require_budget(config, build_model(config, task).is_learned)

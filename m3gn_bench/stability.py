@@ -222,13 +222,13 @@ class Given:
     Attributes:
         context: as the model sees it.
         truth: what the simulator says, in usual units; None where it says nothing.
-        factor, shift: from usual units to those that the model sees.
+        factor, shift: from usual units to those that the model sees; the shift has shape [dim], or is 0.
     """
 
     context: Context
     truth: "torch.Tensor | None"
     factor: float = 1.0
-    shift: float = 0.0
+    shift: "torch.Tensor | float" = 0.0
 
     def usual(self, positions: "torch.Tensor") -> "torch.Tensor":
         """Positions that the model sees or predicts, in usual units."""
@@ -275,7 +275,7 @@ def _case(task: Task, material: int | None = None) -> Case:
     return case_from(task, scene, scene.simulate(parameters), trajectory_key("test", 0))
 
 
-def _given(case: Case, size: int, factor: float = 1.0, shift: float = 0.0) -> Given:
+def _given(case: Case, size: int, factor: float = 1.0, shift: "torch.Tensor | float" = 0.0) -> Given:
     return Given(_map(case, lambda t: t * factor + shift).context(size), case.future(size), factor, shift)
 
 
@@ -299,6 +299,16 @@ def _longer(task: Task, factor: int) -> Given:
     return Given(Context(case.body, case.positions[:size], frames - size, path, case.keys), None)
 
 
+def _shifted(task: Task) -> Given:
+    """Ten scenes away; where the ground is at height zero, along the ground."""
+    import torch
+
+    shift = torch.full((task.dimension,), 20.0)
+    if task.height_feature:
+        shift[-1] = 0
+    return _given(_case(task), _middle(task), shift=shift)
+
+
 def _double(task: Task) -> Given:
     """Everything in double precision."""
     import torch
@@ -313,7 +323,7 @@ MODEL_CELLS: dict[str, Callable[[Task], Given]] = {
     "four times the horizon": lambda task: _longer(task, 4),
     "a tenth of the size": lambda task: _given(_case(task), _middle(task), factor=0.1),
     "ten times the size": lambda task: _given(_case(task), _middle(task), factor=10.0),
-    "shifted by ten scenes": lambda task: _given(_case(task), _middle(task), shift=20.0),
+    "shifted by ten scenes": _shifted,
     "softest material of the scene": lambda task: _given(_case(task, material=0), _middle(task)),
     "stiffest material of the scene": lambda task: _given(_case(task, material=1), _middle(task)),
     "double precision": _double,

@@ -86,6 +86,9 @@ def render(tradeoffs: Sequence[TradeOff], stabilities: Sequence[Stability]) -> s
         counts = {v: sum(c.verdict == v for s in stabilities for c in s.cells) for v in
                   ("correct", "refused", "bounded", "wrong")}  # fmt: skip
         parts.append(", ".join(f"{count} {verdict}" for verdict, count in counts.items()) + ".\n")
+        wrong = [f"{c.subject} on {TASKS[s.task].title}, {c.cell}" for s in stabilities for c in s.wrong]
+        if wrong:
+            parts.append(f"Wrong: {'; '.join(wrong)}.\n")
         parts += [_stability(one) for one in stabilities]
     return "\n".join(parts)
 

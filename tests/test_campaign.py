@@ -237,6 +237,17 @@ def test_shipped_plans_can_be_read() -> None:
     }
 
 
+def test_ablations_train_as_what_they_are_ablations_of() -> None:
+    """At the same rate; and with as many steps where the network is the same."""
+    planned = read_plan(PLANS / "ablations.toml")
+    training = {(run.task, run.config.model_name): run.config.training for run in planned}
+    for (task, name), found in training.items():
+        origin = "mgn" if name.startswith("mgn") else "m3gn"
+        assert found.learning_rate == training[task, origin].learning_rate, name
+        if "noise" in name or "history" in name:
+            assert found == training[task, origin], name
+
+
 def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
     lines = [
         {"preset": "smoke", "task": task, "steps_per_minute": paces, "machine": "one", "commit": None}
@@ -254,6 +265,9 @@ def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
         "mgn": (241, None),
         "m3gn": (67, None),
     }
+    plan_of_one = write(tmp_path, grid, head=HEAD + 'pace = "pace.jsonl"\npace_of = { mgn = "m3gn" }\n')
+    assert {run.config.training.steps for run in read_plan(plan_of_one)} == {67}
+    plan = write(tmp_path, grid, head=HEAD + 'pace = "pace.jsonl"\n')
     path.write_text(json.dumps(lines[1]) + "\n")
     with pytest.raises(ConfigError, match=r"has no pace of mgn with preset 'smoke' on sheet_deformation"):
         read_plan(plan)
