@@ -78,7 +78,7 @@ class Plan(Record):
     tier: str = "paper"
     split: Split = "test"
     pace: str | None = None
-    pace_of: dict[str, str] = {}
+    pace_of: dict[str, str] = Field(default={})
     runs: tuple[Grid, ...] = Field(min_length=1)
 
 
