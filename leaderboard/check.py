@@ -7,6 +7,7 @@ import numpy as np
 
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.datasets.schema import Record
+from m3gn_bench.errors import CheckpointError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.campaign import Outcome
 from m3gn_bench.leaderboard.consistency import contradictions
@@ -50,10 +51,19 @@ class CheckReport(Record):
         return cls(ok=ok, compared=tuple(compared), problems=tuple(problems))
 
 
-def sample(records: Sequence[ResultRecord], count: int, offset: int) -> list[ResultRecord]:
-    """So many records from all over the board, others for every offset, so that repeated checks cover all."""
+def sample(records: Sequence[ResultRecord], count: int, offset: int) -> tuple[list[ResultRecord], int]:
+    """So many records from all over the board, others for every offset; and how often all had their turn before.
+
+    With that number for an offset of `check_records`, repeated checks cover all trajectories of all records.
+    """
     turns = max(1, -(-len(records) // count))
-    return list(records[offset % turns :: turns])
+    return list(records[offset % turns :: turns]), offset // turns
+
+
+def chosen(number: int, count: int, offset: int) -> list[int]:
+    """So many of a number of trajectories, others for every offset, until all had their turn."""
+    count = min(count, number)
+    return sorted({(offset * count + place) % number for place in range(count)})
 
 
 def check_records(
@@ -68,7 +78,7 @@ def check_records(
     Args:
         records: what to check.
         trajectories: how many per record.
-        offset: shifts which ones, so that repeated checks cover all.
+        offset: which ones, see `chosen`.
         on_progress: called with (done, total) after every record.
     """
     compared: list[Comparison] = []
@@ -79,14 +89,16 @@ def check_records(
         if not folder.is_dir():
             problems.append(f"{where}: its checkpoint does not ship with the project")
             continue
-        model, description = load_checkpoint(folder)
+        try:
+            model, description = load_checkpoint(folder)
+        except CheckpointError as error:
+            problems.append(f"{where}: {error}")
+            continue
         if description != record.checkpoint:
             problems.append(f"{where}: the shipped checkpoint is not the one that was recorded")
             continue
-        problems += [f"{where}: {problem}" for problem in contradictions(record)]
-        count = min(trajectories, len(record.keys))
-        chosen = sorted({(offset * count + i) % len(record.keys) for i in range(count)})
-        cases, hashes = regenerate(get_task(record.task), [record.keys[i] for i in chosen])
+        places = chosen(len(record.keys), trajectories, offset)
+        cases, hashes = regenerate(get_task(record.task), [record.keys[place] for place in places])
         errors = evaluate_model(model, cases, [result.context for result in record.results])
         for result in record.results:
             found = errors[result.context]
@@ -96,13 +108,22 @@ def check_records(
                     record,
                     result.context,
                     index,
-                    (float(found.mse[place]), float(found.mse_free_nodes[place])),
-                    hashes[place][:HASH_DIGITS],
+                    (float(found.mse[row]), float(found.mse_free_nodes[row])),
+                    hashes[row][:HASH_DIGITS],
                 )
-                for place, index in enumerate(chosen)
+                for row, index in enumerate(places)
             ]
         on_progress(done, len(records))
     return CheckReport.of(compared, problems)
+
+
+def check_statements(records: Sequence[ResultRecord]) -> list[str]:
+    """What records say of themselves that is not so, whether or not their numbers can be re-derived."""
+    return [
+        f"{record.track}: {record.task}/{record.name}: {problem}"
+        for record in records
+        for problem in contradictions(record)
+    ]
 
 
 def compare_with_retrained(records: Sequence[ResultRecord], again: Sequence[Outcome]) -> CheckReport:

@@ -3,11 +3,11 @@
 from pydantic import ValidationError
 
 from m3gn_bench.datasets.errors import unknown_name
-from m3gn_bench.datasets.schema import TIERS, as_split
+from m3gn_bench.datasets.schema import SPLITS, TIERS, as_split
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.model import RunConfig, build_model, model_names
-from m3gn_bench.sources import dataset_version, number_of_trajectories
+from m3gn_bench.sources import dataset_version, number_of_trajectories, trajectory_names
 from m3gn_bench.tasks import TASKS
 
 OVERTIME = 1.1  # a budget in minutes ends with the step that exceeds it
@@ -23,7 +23,9 @@ def contradictions(record: ResultRecord) -> list[str]:
         return [unknown_name("task", record.task, list(TASKS))]
     if record.tier not in TIERS:
         return [unknown_name("tier", record.tier, list(TIERS))]
-    task, described = TASKS[record.task], record.checkpoint
+    if record.split not in SPLITS:
+        return [unknown_name("split", record.split, list(SPLITS))]
+    task, described, split = TASKS[record.task], record.checkpoint, as_split(record.split)
     frames = {result.context + len(result.per_timestep_mse) for result in record.results}
     expected: dict[str, tuple[object, object]] = {
         "checkpoint's task, model, preset and seed": (
@@ -35,9 +37,13 @@ def contradictions(record: ResultRecord) -> list[str]:
         "frames that errors are of": (sorted(frames), [task.frames]),
     }
     if not record.materials:
-        number = number_of_trajectories(task, record.tier, as_split(record.split))
+        number = number_of_trajectories(task, record.tier, split)
         expected["number of trajectories"] = (len(record.keys), number)
     found = [f"{name}: {stated}, not {true}" for name, (stated, true) in expected.items() if stated != true]
+    names = trajectory_names(task, record.tier, split)
+    strange = sorted(set(record.keys) - set(names))
+    if strange:
+        found.append(f"trajectories: {strange[0]} is none of the {split} split of tier {record.tier}")
     return found + (_of_the_configuration(record) if record.model in model_names() else [])
 
 

@@ -205,6 +205,7 @@ def check_command(
         CheckReport,
         Comparison,
         check_records,
+        check_statements,
         compare_with_retrained,
         sample,
     )
@@ -218,14 +219,10 @@ def check_command(
     report = Report(as_json)
     shipped = [record for record in records if record.ships]
     today = date.today().toordinal() if offset is None else offset
+    sampled, rounds = sample(shipped, count, today)
     with report.progress("re-deriving") as on_progress:
-        found = check_records(
-            sample(shipped, count, today),
-            trajectories=trajectories,
-            offset=today,
-            on_progress=on_progress,
-        )
-    compared, problems = list(found.compared), list(found.problems)
+        found = check_records(sampled, trajectories=trajectories, offset=rounds, on_progress=on_progress)
+    compared, problems = list(found.compared), [*check_statements(records), *found.problems]
     if retrain:
         planned = [run for run in read_plan(PLANS / "smoke.toml") if task_name in (None, run.task)]
         with report.progress("training again") as on_progress:

@@ -13,7 +13,7 @@ from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.errors import unknown_name
 from m3gn_bench.datasets.file import find_dataset, open_file, read_metadata
 from m3gn_bench.datasets.plugins import leave_out
-from m3gn_bench.datasets.schema import SPLITS, Split, parse_key, tier_sizes
+from m3gn_bench.datasets.schema import SPLITS, Split, parse_key, tier_sizes, trajectory_key
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.tasks import TASKS, Task, task_of_data
 
@@ -87,6 +87,14 @@ def number_of_trajectories(task: Task, tier: str, split: Split) -> int:
 
     scene = get_scene(task.scene)
     return scene.task_size(task.name, split, tier_sizes(tier, scene.paper_sizes)[split])
+
+
+def trajectory_names(task: Task, tier: str, split: Split) -> list[str]:
+    """All that a tier's split has in the dataset, also those that take no part in the task."""
+    from m3gn_bench.generators.scene import get_scene
+
+    scene = get_scene(task.scene)
+    return [trajectory_key(split, index) for index in range(tier_sizes(tier, scene.paper_sizes)[split])]
 
 
 def dataset_version(task: Task) -> str:
