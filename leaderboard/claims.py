@@ -15,11 +15,10 @@ import numpy as np
 from scipy.stats import ttest_ind, ttest_rel
 
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_of_less
+from m3gn_bench.leaderboard.summary import SEEDS, Entry, entries, middle, probability_of_less
 from m3gn_bench.tasks import OWN_TASKS
 
 CONFIDENCE = 0.975
-SEEDS = 3  # fewer say too little of what another seed would give
 MARGIN = 0.1  # what counts as no worse
 Outcome = Literal["holds", "contradicted", "undecided", "not measured yet"]
 

@@ -11,6 +11,8 @@ from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.metrics import bootstrap_means
 from m3gn_bench.tasks import TASKS
 
+SEEDS = 3  # fewer say too little of what another seed would give
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -47,6 +49,11 @@ class Entry:
     def seeds(self) -> int:
         """Number of seeds."""
         return len(self.records)
+
+    @property
+    def has_enough_seeds(self) -> bool:
+        """Whether it can be compared with other rows; what does not learn is the same for every seed."""
+        return self.seeds >= SEEDS or self.training_steps == 0
 
     @property
     def parameters(self) -> int:
@@ -134,6 +141,8 @@ def probability_below(row: Entry, yardstick: Entry | None, context: int) -> floa
         return None
     if yardstick.records[0].keys != row.records[0].keys:
         return None
+    if not (yardstick.has_enough_seeds and row.has_enough_seeds):
+        return None
     return probability_of_less(row, yardstick, context)
 
 
@@ -143,21 +152,37 @@ def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entr
     Like is compared with like: of records on several versions of the data only those on the latest count.
 
     Raises:
-        BenchError: records are of different tiers or splits.
+        BenchError: records are of different tiers, splits or presets, or those of a row do not belong together.
     """
     board = [record for record in records if (record.track, record.task) == (track, task)]
     latest = max((_number(record) for record in board), default=())
-    groups: dict[tuple[str, str, str], list[ResultRecord]] = {}
+    groups: dict[tuple[str, str], list[ResultRecord]] = {}
     for record in board:
         if (record.tier, record.split) != (board[0].tier, board[0].split):
             raise BenchError(
                 f"{track}/{task}: {record.name} was scored on {record.split} trajectories of tier {record.tier}, but "
                 f"{board[0].name} on {board[0].split} trajectories of tier {board[0].tier}; use another track"
             )
+        if record.preset != board[0].preset:
+            raise BenchError(
+                f"{track}/{task}: {record.name} is of preset {record.preset}, but {board[0].name} of preset "
+                f"{board[0].preset}; use another track"
+            )
         if _number(record) == latest:
-            groups.setdefault((record.model, record.preset, record.variant), []).append(record)
+            row = groups.setdefault((record.model, record.variant), [])
+            if row and _belongs(record) != _belongs(row[0]):
+                raise BenchError(
+                    f"{track}/{task}: {record.name} has other trajectories or settings than {row[0].name}; make the "
+                    "older one again, or name what differs by a variant"
+                )
+            row.append(record)
     found = [Entry(tuple(sorted(group, key=lambda r: r.seed))) for group in groups.values()]
     return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
+
+
+def _belongs(record: ResultRecord) -> tuple[object, ...]:
+    """What is the same for all seeds of a row."""
+    return record.keys, record.materials, record.checkpoint.config
 
 
 def _number(record: ResultRecord) -> tuple[tuple[int, str], ...]:

@@ -457,6 +457,12 @@ def test_a_board_compares_like_with_like(board: Path) -> None:
         assert [row.label for row in summary.entries([old, new], one.track, one.task)] == [new.model]
     with pytest.raises(BenchError, match="tier quick"):
         summary.entries([one, other.model_copy(update={"tier": "quick"})], one.track, one.task)
+    with pytest.raises(BenchError, match="of preset large, but"):
+        summary.entries([one, other.model_copy(update={"preset": "large"})], one.track, one.task)
+    for changes in ({"keys": one.keys[::-1]}, {"materials": {"youngs_modulus": (10.0,)}}, longer(one)):
+        seed = one.model_copy(update=changes | {"seed": 1})
+        with pytest.raises(BenchError, match="has other trajectories or settings than"):
+            summary.entries([one, seed], one.track, one.task)
 
 
 def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecord) -> None:

@@ -62,7 +62,7 @@ def home(tmp_path_factory: pytest.TempPathFactory, smoke_file: Path) -> Path:
         assert outcome.error is None
         outcome.keep(folder)
     # A board compares like with like.
-    data = {"tier": "smoke", "dataset_version": get_scene(TASK.scene).dataset_version}
+    data = {"preset": "smoke", "tier": "smoke", "dataset_version": get_scene(TASK.scene).dataset_version}
     for model, error, seed in (
         ("egno", 3e-4, 0),
         ("mango", 2e-5, 0),
@@ -316,14 +316,20 @@ def test_unknown_tier(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_rows_are_sorted_and_placed() -> None:
-    rows = board_rows([made_up("mgn", 4.0), made_up("m3gn", 1.0), made_up("egno", 2.0)])
+    records = [
+        made_up(model, error, seed=seed)
+        for model, error in (("mgn", 4.0), ("m3gn", 1.0))
+        for seed in range(3)
+    ]
+    rows = board_rows([*records, made_up("egno", 2.0)])
     assert [row.entry.label for row in rows[:3]] == ["m3gn", "egno", "mgn"]
     assert [row.context for row in rows] == [2, 2, 2, 5, 5, 5, 10, 10, 10]
     low, mean, high = zip(*(row.places for row in rows[:3]), strict=True)
     assert (min(low), max(high)) == pytest.approx((0, 100))
     assert list(mean) == sorted(mean)
     assert rows[0].probability is None
-    assert rows[1].probability == 0.0
+    assert rows[1].probability is None  # of one seed
+    assert rows[2].probability == 0.0
 
 
 def script_of(site: Path, name: str) -> dict[str, Any]:
