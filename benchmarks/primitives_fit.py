@@ -26,13 +26,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="falling_teddy")
     parser.add_argument("--preset", default="compact")
-    parser.add_argument("--trajectories", type=int, default=20, help="spread over the test split")
+    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
     add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(1)
 
     task = get_task(options.task)
-    cases = spread_cases(task, "test", options)
+    cases = spread_cases(task, "validation", options)
     config = load_preset("m3gn", options.preset, task).model
     assert isinstance(config, PrimitivesConfig)
     primitives = ProDMP(config.basis_functions, config.alpha, config.alpha_x)

@@ -22,7 +22,6 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
 
 import hashlib
 import json
-import shutil
 import tomllib
 import traceback
 from collections.abc import Sequence
@@ -32,6 +31,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
+from m3gn_bench.checkpoint import copy_checkpoint
 from m3gn_bench.data import Materials, load_cases
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.file import content_hash, open_file, read_metadata
@@ -222,9 +222,7 @@ class Outcome:
         if self.run.ships:
             config = self.run.config
             shipped = checkpoint_folder(self.run.task, config.model_name, config.preset, self.run.seed, home)
-            shutil.rmtree(shipped, ignore_errors=True)
-            half_written = shutil.ignore_patterns(".*")  # left by a process that was killed
-            shutil.copytree(self.folder, shipped, ignore=half_written)
+            copy_checkpoint(self.folder, shipped)
         write_record(self.record, home)
 
 

@@ -51,16 +51,18 @@ def _of_the_configuration(record: ResultRecord) -> list[str]:
     described = record.checkpoint
     try:
         config = RunConfig.from_json(described.config.model_dump())
-        parameters = build_model(config, TASKS[record.task]).parameter_count()
+        model = build_model(config, TASKS[record.task])
     except (ConfigError, ValidationError) as error:
         return [f"configuration: none of {record.model}: {error}"]
     found = []
     if config.hash() != described.config_hash:
         found.append(f"config_hash: {described.config_hash}, not {config.hash()}")
-    if parameters != record.parameters:
-        found.append(f"parameters: {record.parameters}, not {parameters}")
+    if model.parameter_count() != record.parameters:
+        found.append(f"parameters: {record.parameters}, not {model.parameter_count()}")
     budget = config.training
-    if budget.steps is not None and described.steps not in (0, budget.steps):
+    if model.is_learned and described.steps == 0:
+        found.append(f"steps: 0, but {record.model} learns")
+    elif model.is_learned and budget.steps is not None and described.steps != budget.steps:
         found.append(f"steps: {described.steps}, not the {budget.steps} of its settings")
     if budget.minutes is not None and described.minutes > OVERTIME * budget.minutes:
         found.append(f"minutes: {described.minutes:.3g}, not the {budget.minutes:.3g} of its settings")

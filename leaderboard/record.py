@@ -1,6 +1,7 @@
 """Result records: one JSON file per track, task, model and seed, with every test trajectory's error."""
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -111,7 +112,7 @@ class ResultRecord(Record):
     machine: str
     evaluation_device: str
     evaluation_threads: int
-    evaluation_seconds: float
+    evaluation_seconds: float = Field(ge=0)
     checkpoint: Checkpoint
     ships: bool
     results: tuple[ContextResult, ...]
@@ -184,11 +185,15 @@ def _rounded(value: object) -> object:
 
 def read_record(path: Path) -> ResultRecord:
     """One record. Raises BenchError if the file is none, or its numbers contradict each other."""
+    content = path.read_bytes()
     try:
-        return ResultRecord.model_validate_json(path.read_bytes())
+        return ResultRecord.model_validate_json(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
+        stated = re.search(rb'"record_schema": *(\d+)', content)
+        if stated is not None and int(stated[1]) != RECORD_SCHEMA:
+            place = f"its record_schema is {int(stated[1])}, and this version reads {RECORD_SCHEMA}; {place}"
         raise BenchError(f"{path} is no valid result record: {place}: {first['msg']}") from error
 
 

@@ -5,7 +5,11 @@ from collections.abc import Sequence
 from m3gn_bench.datasets.schema import IMPORTED, Record
 from m3gn_bench.leaderboard.consistency import contradictions
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
-from m3gn_bench.model import model_names
+from m3gn_bench.model import load_preset, model_names
+from m3gn_bench.tasks import get_task
+from m3gn_bench.version import __version__
+
+LONG = 1.5  # times as long as all others of a board; machines differ, too
 
 
 class Verdict(Record):
@@ -43,8 +47,15 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     problems += contradictions(record)
     if record.model not in model_names():
         remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
+    elif not problems and not record.variant and not _is_of_preset(record):
+        problems.append(
+            f"its settings are not those of preset {record.preset!r}; name what differs by a variant"
+        )
+    if record.package_version != __version__:
+        remarks.append(f"it was made with version {record.package_version}, not {__version__}")
 
     problems += _unequal_conditions(record, board)
+    remarks += _long_training(record, board)
     peers = [
         peer
         for peer in board
@@ -54,12 +65,19 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     if not peers:
         remarks.append("nothing on the board was scored on such trajectories: the data were not compared")
         return Verdict(problems=tuple(problems), remarks=tuple(remarks))
+    trained_on = {peer.checkpoint.dataset_hash for peer in peers}
+    if record.checkpoint.dataset_hash not in trained_on:
+        remarks.append(
+            "nothing on the board was trained on the same bits; it may be another kind of processor, or other data"
+        )
     peer = peers[0]
     if record.keys != peer.keys:
         problems.append(f"it has other trajectories than {peer.task}/{peer.name}, or another order of them")
     else:
         pairs = zip(record.trajectory_hashes, peer.trajectory_hashes, strict=True)
         different = sum(own != theirs for own, theirs in pairs)
+        if not different and record.dataset_hash not in {peer.dataset_hash for peer in peers}:
+            problems.append("dataset_hash is that of other trajectories than trajectory_hashes say")
         if different:
             remarks.append(
                 f"{different} of {len(record.keys)} trajectories differ in some bit from those on record; on another "
@@ -68,13 +86,29 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     return Verdict(problems=tuple(problems), remarks=tuple(remarks))
 
 
+def _is_of_preset(record: ResultRecord) -> bool:
+    usual = load_preset(record.model, record.preset, get_task(record.task))
+    return record.checkpoint.config_hash == usual.hash()
+
+
+def _long_training(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    beside = [peer for peer in board if (peer.track, peer.task) == (record.track, record.task)]
+    longest = max((peer.checkpoint.minutes for peer in beside), default=0.0)
+    if longest and record.checkpoint.minutes > LONG * longest:
+        return [
+            f"it was trained for {record.checkpoint.minutes:.3g} minutes, the others of its board for {longest:.3g} at "
+            "most: is its machine so much slower?"
+        ]
+    return []
+
+
 def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
     """In what a submission differs from the records that it would stand beside, where all must be equal."""
 
     def conditions(of: ResultRecord) -> dict[str, object]:
         trained = of.checkpoint
         where = {"device": trained.device, "threads": trained.threads, "processes": trained.processes}
-        return {"tier": of.tier, "split": of.split} | (where if trained.steps else {})
+        return {"tier": of.tier, "split": of.split, "preset": of.preset} | (where if trained.steps else {})
 
     def budget(of: ResultRecord) -> dict[str, object]:
         return {name: of.checkpoint.config.training.get(name) for name in ("minutes", "steps")}
@@ -89,10 +123,10 @@ def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> 
                 f"{name} is {value}, but {', '.join(map(str, theirs))} for all others of track {record.track!r}"
             )
     for peer in beside:
-        same_row = (peer.model, peer.preset, peer.variant) == (record.model, record.preset, record.variant)
-        if not same_row:
+        if (peer.model, peer.preset) != (record.model, record.preset):
             continue
-        if peer.checkpoint.config_hash != record.checkpoint.config_hash or peer.materials != record.materials:
+        same = peer.checkpoint.config_hash, peer.materials
+        if peer.variant == record.variant and same != (record.checkpoint.config_hash, record.materials):
             problems.append(f"its settings are not those of {peer.name}; name what differs by a variant")
             break
         if budget(peer) != budget(record):

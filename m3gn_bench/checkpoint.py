@@ -67,6 +67,12 @@ def save_checkpoint(folder: Path, weights: dict[str, Tensor], description: Check
     write_bytes_atomically(folder / DESCRIPTION, (complete.model_dump_json(indent=2) + "\n").encode())
 
 
+def copy_checkpoint(source: Path, target: Path) -> None:
+    """Copy a checkpoint, and nothing else that its run left; the description comes last, as in `save_checkpoint`."""
+    for name in (WEIGHTS, DESCRIPTION):
+        write_bytes_atomically(target / name, (source / name).read_bytes())
+
+
 def read_description(folder: Path) -> Checkpoint:
     """The description of a checkpoint. Raises CheckpointError if there is none or it is damaged."""
     path = folder / DESCRIPTION

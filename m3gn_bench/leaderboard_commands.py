@@ -296,13 +296,19 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
 
     RECORD is a file that `m3gn-bench evaluate --record FOLDER` wrote.
     """
+    from m3gn_bench.datasets.errors import BenchError
     from m3gn_bench.leaderboard.record import read_record, read_records, write_record
-    from m3gn_bench.leaderboard.submission import review
+    from m3gn_bench.leaderboard.submission import Verdict, review
 
-    # Its author may have kept the checkpoint beside the record; this board does not.
-    submitted = read_record(record).model_copy(update={"ships": False})
-    verdict = review(submitted, read_records(home), replace)
-    path = None if verdict.problems else write_record(submitted, home)
+    board, path = read_records(home), None
+    try:
+        # Its author may have kept the checkpoint beside the record; this board does not.
+        submitted = read_record(record).model_copy(update={"ships": False})
+    except BenchError as error:
+        verdict = Verdict(problems=(str(error),), remarks=())
+    else:
+        verdict = review(submitted, board, replace)
+        path = None if verdict.problems else write_record(submitted, home)
     Report(as_json).finish(
         {"file": None if path is None else str(path), **verdict.model_dump(mode="json")},
         *(f"refused: {problem}" for problem in verdict.problems),

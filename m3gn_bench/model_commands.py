@@ -177,6 +177,12 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     default=None,
     help="Also write a result record below this folder (in a checkout: leaderboard).",
 )
+@click.option(
+    "--variant",
+    default="",
+    help="For --record: what differs from the model's preset, in a word (needed where settings do).",
+)
+@click.option("--replace", is_flag=True, help="For --record: replace a record of the same name.")
 @DATASET
 @DEVICE
 @THREADS
@@ -194,6 +200,8 @@ def evaluate(
     split: str,
     track: str,
     record_home: Path | None,
+    variant: str,
+    replace: bool,
     dataset: Path | None,
     device: str,
     threads: int,
@@ -251,6 +259,9 @@ def evaluate(
                 f"Models: {', '.join(model_names())}"
             )
 
+    if record_home is not None:
+        for folder in folders.values():
+            _require_recordable(folder, record_home, track, variant, replace)
     recorded = read_records()
     rows: list[dict[str, Any]] = []
     for name, folder in folders.items():
@@ -276,6 +287,7 @@ def evaluate(
                 tier=tier,
                 split=part,
                 contexts=sizes,
+                variant=variant,
                 ships=record_home is not None and _is_shipped(folder, record_home),
                 device=device,
                 on_progress=on_progress,
@@ -343,6 +355,30 @@ def evaluate(
             ],
         ),
     )
+
+
+def _require_recordable(folder: Path, home: Path, track: str, variant: str, replace: bool) -> None:
+    """Raises ConfigError if a record would replace another, or pass for one of the model's preset and is not."""
+    from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.errors import ConfigError
+    from m3gn_bench.leaderboard.record import find_record, read_records, run_name
+    from m3gn_bench.model import load_preset
+    from m3gn_bench.tasks import get_task
+
+    found = read_description(folder)
+    config = found.config
+    name = run_name(config.model_name, config.preset, variant, found.seed)
+    if not replace and find_record(read_records(home), track, found.task, name) is not None:
+        raise ConfigError(
+            f"{home} has a record of {found.task}/{name} on track {track!r} already; give --replace to replace it, or "
+            "another --track"
+        )
+    usual = load_preset(config.model_name, config.preset, get_task(found.task))
+    if not variant and found.config_hash != usual.hash():
+        raise ConfigError(
+            f"{folder} was trained with other settings than preset {config.preset!r} has; name what differs with "
+            "--variant"
+        )
 
 
 def _is_shipped(checkpoint: Path, home: Path) -> bool:

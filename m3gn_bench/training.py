@@ -317,9 +317,9 @@ class Run:
         except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); delete it to start again") from error
         if parsed["identity"] != json.loads(json.dumps(self.identity)):
-            raise CheckpointError(
-                f"{path} belongs to a run with other settings; delete it or use another folder"
-            )
+            before = parsed["identity"].get("package_version")
+            other = "with other settings" if before == __version__ else f"of version {before}"
+            raise CheckpointError(f"{path} belongs to a run {other}; delete it or use another folder")
         self.progress = Progress(**parsed["progress"])
         self.rng.bit_generator.state = parsed["rng"]
 

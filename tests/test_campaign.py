@@ -22,6 +22,7 @@ from m3gn_bench.leaderboard.check import compare_with_retrained
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.model import load_preset
+from m3gn_bench.sources import dataset_version
 from m3gn_bench.tasks import TASKS, get_task
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
@@ -235,6 +236,17 @@ def test_shipped_plans_can_be_read() -> None:
     assert set(trials) == {
         run.config.model_name for run in plans["compact"] if run.config.training.steps is not None
     }
+
+
+def test_shipped_records_are_of_their_plans() -> None:
+    """A change of a plan, a pace or a preset asks for new records."""
+    records = read_records()
+    for path in PLANS.glob("*.toml"):
+        for planned in read_plan(path):
+            version = dataset_version(get_task(planned.task))
+            assert planned.state(records, version) != "outdated", (
+                f"{path.stem}: {planned.task}/{planned.name}"
+            )
 
 
 def test_ablations_train_as_what_they_are_ablations_of() -> None:

@@ -21,6 +21,7 @@ from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.leaderboard import campaign, check, record, render, submission, summary
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
 from m3gn_bench.metrics import TrajectoryErrors
+from m3gn_bench.model import RunConfig
 from m3gn_bench.tasks import get_task
 
 
@@ -361,6 +362,13 @@ def training(**changes: object) -> Changes:
     return change
 
 
+def other_settings(record: ResultRecord) -> dict[str, Any]:
+    """Another learning rate than the preset's, and a hash that says so, on a board of its own."""
+    changed = training(learning_rate=1e-4)(record)["checkpoint"]
+    config = RunConfig.from_json(changed.config.model_dump())
+    return {"checkpoint": changed.model_copy(update={"config_hash": config.hash()})}
+
+
 def longer(record: ResultRecord) -> dict[str, Any]:
     """Trained for more steps than the others of its row, and says so; another seed."""
     changed = training(steps=600)(record)["checkpoint"].model_copy(update={"steps": 600, "seed": 1})
@@ -420,6 +428,14 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         (checkpoint(config_hash="0"), "config_hash: 0, not"),
         (training(optimizer="sgd"), "configuration: none of mgn"),
         (per_timestep(-1), "frames that errors are of"),
+        (checkpoint(steps=0), "steps: 0, but mgn learns"),
+        (
+            lambda record: longer(record) | {"variant": "long"},
+            "its budget is {'minutes': None, 'steps': 600}, but",
+        ),
+        ({"track": "test", "seed": 1, "preset": "compact"}, "preset is compact, but smoke"),
+        ({"dataset_hash": "0"}, "dataset_hash is that of other trajectories"),
+        (other_settings, "not those of preset 'smoke'; name what differs by a variant"),
     ],
 )
 def test_what_is_wrong_with_a_submission_is_named(
@@ -474,13 +490,79 @@ def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecor
     assert not any("split" in p for p in submission.review(trial, [*records, other]).problems)
 
 
-def test_a_submission_on_other_bits_or_by_an_unknown_model_is_remarked(
-    board: Path, submitted: ResultRecord
-) -> None:
+def test_a_submission_on_other_bits_is_remarked(board: Path, submitted: ResultRecord) -> None:
     other = submitted.model_copy(update={"trajectory_hashes": ("0" * 16, *submitted.trajectory_hashes[1:])})
     verdict = submission.review(other, read_records(board))
     assert not verdict.problems
-    assert "1 of 4 trajectories differ" in verdict.remarks[0]
+    (remark,) = verdict.remarks
+    assert "1 of 4 trajectories differ" in remark
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"package_version": "99"}, "made with version 99"),
+        (checkpoint(dataset_hash="0"), "nothing on the board was trained on the same bits"),
+        (checkpoint(minutes=1e3), "is its machine so much slower?"),
+        ({"model": "theirs"}, "theirs is not installed here"),
+    ],
+)
+def test_what_readers_of_a_submission_should_know_is_remarked(
+    board: Path, submitted: ResultRecord, changes: Any, reason: str
+) -> None:
+    if callable(changes):
+        changes = changes(submitted)
+    verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
+    assert any(reason in remark for remark in verdict.remarks), verdict
+
+
+def test_a_submission_that_cannot_be_read_is_refused(
+    board: Path, submitted: ResultRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As found wrong, with JSON; one of another schema is told so."""
+    path = write_record(submitted, tmp_path)
+    text = path.read_text()
+    without = json.loads(text)
+    del without["machine"]
+    for content, reason in (
+        (text.replace('"mse": ', '"mse": 1'), "does not follow"),
+        (json.dumps(without | {"record_schema": 2}), "record_schema is 2, and this version reads 3"),
+    ):
+        path.write_text(content)
+        with pytest.raises(SystemExit) as stop:
+            run(["leaderboard", "submit", str(path), "--home", str(board), "--json"])
+        outcome = json.loads(capsys.readouterr().out)
+        assert (stop.value.code, outcome["file"]) == (1, None)
+        assert reason in outcome["problems"][0]
+
+
+def test_a_record_is_not_replaced_by_accident(
+    board: Path, smoke_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor does one of other settings pass for the preset's."""
+    folder = checkpoint_folder("sheet_deformation", "stand_still", "smoke", home=board)
+    home = tmp_path / "home"
+    score = ["evaluate", "--model", "stand_still", "--checkpoint", str(folder), "--record", str(home)]
+    score += ["--data", str(smoke_file.parent), "--tier", "smoke", "--track", "test"]
+    for more, code, message in (
+        ([], 0, ""),
+        ([], 2, "give --replace to replace it"),
+        (["--replace"], 0, ""),
+        (["--variant", "again"], 0, ""),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            run([*score, *more])
+        assert (stop.value.code or 0) == code
+        assert message in capsys.readouterr().err
+    assert [r.variant for r in read_records(home)] == ["again", ""]
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    description = other / "checkpoint.json"
+    description.write_text(description.read_text().replace('"config_hash": "', '"config_hash": "0'))
+    with pytest.raises(SystemExit) as stop:
+        run([*score, "--checkpoint", str(other), "--replace"])
+    assert stop.value.code == 2
+    assert "name what differs with --variant" in " ".join(capsys.readouterr().err.split())
 
 
 def test_evaluation_is_deterministic(

@@ -47,7 +47,18 @@ def test_from_nothing_to_the_board(environment: dict[str, str], tmp_path: Path) 
         budget = "--steps", 10, "--set", "training.validations=1"
         done = command(environment, "train", *which, "--tier", "smoke", *budget, "--out", out, *data)
         assert done["steps"] == 10
-        score = "--tier", "smoke", "--track", "smoke", "--threads", 1, "--record", board
+        score = (
+            "--tier",
+            "smoke",
+            "--track",
+            "smoke",
+            "--threads",
+            1,
+            "--record",
+            board,
+            "--variant",
+            "validated once",
+        )
         found = command(environment, "evaluate", *which, "--checkpoint", out, *score, *data)
         assert [(row["task"], row["context"]) for row in found["results"]] == [
             (NAME, context) for context in (2, 5, 10)
@@ -56,8 +67,8 @@ def test_from_nothing_to_the_board(environment: dict[str, str], tmp_path: Path) 
     assert rendered["records"] == 2
     page = (board / "LEADERBOARD.md").read_text()
     assert "### Spring Pendulum" in page
-    assert "| m3gn | 1 | 27 183 |" in page
-    assert "| mgn | 1 | 12 194 |" in page
+    assert "| m3gn (validated once) | 1 | 27 183 |" in page
+    assert "| mgn (validated once) | 1 | 12 194 |" in page
 
     # Where the package is not installed, its rows are still there.
     with pytest.raises(SystemExit):
