@@ -259,6 +259,8 @@ def evaluate(
                 f"Models: {', '.join(model_names())}"
             )
 
+    if record_home is None and (variant or replace):
+        raise ConfigError("--variant and --replace say what --record does, which is not given")
     if record_home is not None:
         for folder in folders.values():
             _require_recordable(folder, record_home, track, variant, replace)
@@ -359,12 +361,20 @@ def evaluate(
 
 def _require_recordable(folder: Path, home: Path, track: str, variant: str, replace: bool) -> None:
     """Raises ConfigError if a record would replace another, or pass for one of the model's preset and is not."""
+    from pydantic import TypeAdapter, ValidationError
+
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.errors import ConfigError
-    from m3gn_bench.leaderboard.record import find_record, read_records, run_name
+    from m3gn_bench.leaderboard.record import Variant, find_record, read_records, run_name
     from m3gn_bench.model import load_preset
     from m3gn_bench.tasks import get_task
 
+    try:
+        TypeAdapter(Variant).validate_python(variant)
+    except ValidationError:
+        raise ConfigError(
+            f"--variant {variant!r}: letters, digits, spaces and any of . + = - _ make file names"
+        ) from None
     found = read_description(folder)
     config = found.config
     name = run_name(config.model_name, config.preset, variant, found.seed)

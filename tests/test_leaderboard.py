@@ -548,6 +548,7 @@ def test_a_record_is_not_replaced_by_accident(
         ([], 0, ""),
         ([], 2, "give --replace to replace it"),
         (["--replace"], 0, ""),
+        (["--variant", "a/b"], 2, "make file names"),
         (["--variant", "again"], 0, ""),
     ):
         with pytest.raises(SystemExit) as stop:
