@@ -12,6 +12,7 @@ import click
 from m3gn_bench.console import DATA, DEVICE, JSON, WORKERS, Report, table
 
 if TYPE_CHECKING:
+    from m3gn_bench.leaderboard.record import ResultRecord
     from m3gn_bench.profiling import Profile, Ratios
 
 THREADS = click.option(
@@ -262,8 +263,9 @@ def evaluate(
     if record_home is None and (variant or replace):
         raise ConfigError("--variant and --replace say what --record does, which is not given")
     if record_home is not None:
+        board = [] if replace else read_records(record_home)
         for folder in folders.values():
-            _require_recordable(folder, record_home, track, variant, replace)
+            _require_recordable(folder, board, track, variant)
     recorded = read_records()
     rows: list[dict[str, Any]] = []
     for name, folder in folders.items():
@@ -359,13 +361,13 @@ def evaluate(
     )
 
 
-def _require_recordable(folder: Path, home: Path, track: str, variant: str, replace: bool) -> None:
+def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: str, variant: str) -> None:
     """Raises ConfigError if a record would replace another, or pass for one of the model's preset and is not."""
     from pydantic import TypeAdapter, ValidationError
 
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.errors import ConfigError
-    from m3gn_bench.leaderboard.record import Variant, find_record, read_records, run_name
+    from m3gn_bench.leaderboard.record import Variant, find_record, run_name
     from m3gn_bench.model import load_preset
     from m3gn_bench.tasks import get_task
 
@@ -378,9 +380,9 @@ def _require_recordable(folder: Path, home: Path, track: str, variant: str, repl
     found = read_description(folder)
     config = found.config
     name = run_name(config.model_name, config.preset, variant, found.seed)
-    if not replace and find_record(read_records(home), track, found.task, name) is not None:
+    if find_record(board, track, found.task, name) is not None:
         raise ConfigError(
-            f"{home} has a record of {found.task}/{name} on track {track!r} already; give --replace to replace it, or "
+            f"there is a record of {found.task}/{name} on track {track!r} already; give --replace to replace it, or "
             "another --track"
         )
     usual = load_preset(config.model_name, config.preset, get_task(found.task))
