@@ -53,12 +53,13 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def reserved(folder: Path, taken: str) -> Iterator[None]:
+def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
     """The folder, made if need be, for this process alone (the lock ends with the process).
 
     Args:
         folder: what to reserve.
-        taken: what another process does that holds it, for the message.
+        doing: what another process that holds it does, for the message.
+        place: what a user knows it by, for the message.
 
     Raises:
         DatasetError: another process has it, or it cannot be written.
@@ -67,12 +68,12 @@ def reserved(folder: Path, taken: str) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("w")
     except OSError as error:
-        raise DatasetError(f"cannot write to {folder.parent}: {error.strerror or error}") from error
+        raise DatasetError(f"cannot write to {place}: {error.strerror or error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise DatasetError(f"{taken} in {folder.parent}; wait until it has finished") from None
+            raise DatasetError(f"another process {doing} in {place}; wait until it has finished") from None
         yield
 
 

@@ -180,7 +180,7 @@ def generate(
     }
     shards = {key: _shard(shard_folder, key) for key in wanted}
     together = scene.together if isinstance(scene, SimulatesTogether) else 1
-    with reserved(shard_folder, "another process generates this dataset"):
+    with reserved(shard_folder, "generates this dataset", out):
         for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
             left_by_killed_run.unlink()
         todo: list[str] = []

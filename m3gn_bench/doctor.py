@@ -232,7 +232,7 @@ def simulations() -> Iterator[Finding]:
 
 def predictions() -> Iterator[Finding]:
     """One trajectory of every task with a shipped M3GN, predicted and compared with the record."""
-    from m3gn_bench.leaderboard.check import check_records
+    from m3gn_bench.leaderboard.check import CheckReport, check_records, check_statements
     from m3gn_bench.leaderboard.record import read_records
 
     for record in read_records():
@@ -240,10 +240,11 @@ def predictions() -> Iterator[Finding]:
             continue
         name = f"m3gn on {record.task}"
         try:
-            outcome = check_records([record], trajectories=1, offset=0)
+            found = check_records([record], trajectories=1, offset=0)
         except BenchError as error:
             yield Finding(part="self-test", name=name, state="wrong", detail=str(error))
             continue
+        outcome = CheckReport.of(found.compared, [*check_statements([record]), *found.problems])
         largest = max((c.relative_difference for c in outcome.compared), default=float("nan"))
         detail = "; ".join(outcome.problems) or f"error within {largest:.1e} of the record"
         yield Finding(part="self-test", name=name, state="fine" if outcome.ok else "wrong", detail=detail)

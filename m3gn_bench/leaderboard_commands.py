@@ -375,7 +375,7 @@ def campaign(
     todo = [run for run, state in zip(planned, states, strict=True) if state != "done"]
     problems: dict[str, str] = {}
     if not status and todo:
-        with reserved(runs, "another process carries out a campaign"):
+        with reserved(runs, "carries out a campaign", runs):
             files = {}
             for name in dict.fromkeys(run.task for run in todo):
                 task = get_task(name)

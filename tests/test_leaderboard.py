@@ -175,19 +175,43 @@ def test_what_a_record_says_wrongly_of_itself_is_found(
     assert reason in problem
 
 
-@pytest.mark.parametrize("planted", [False, True])
+@pytest.mark.parametrize(
+    ("model", "plant", "options", "kinds", "reason"),
+    [
+        ("stand_still", lambda one: one, [], {"shipped checkpoint", "trained again"}, None),
+        ("constant_velocity", lambda one: one, [], {"shipped checkpoint"}, "there is no record of it"),
+        (
+            "stand_still",
+            lambda one: one.model_copy(update={"dataset_version": "9.9"}),
+            ["--no-retrain"],
+            {"shipped checkpoint"},
+            "dataset version: 9.9",
+        ),
+        (
+            "stand_still",
+            lambda one: with_errors(one, 0, 1.01),
+            ["--no-retrain"],
+            {"shipped checkpoint"},
+            "recorded and re-derived differ",
+        ),
+    ],
+    ids=["nothing", "a run without a record", "a statement", "errors"],
+)
 def test_the_command_fails_where_a_record_does(
     board: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    planted: bool,
+    model: str,
+    plant: Callable[[ResultRecord], ResultRecord],
+    options: list[str],
+    kinds: set[str],
+    reason: str | None,
 ) -> None:
-    """By its exit code, which CI goes by; also where a planned run has no record."""
+    """By its exit code, which CI goes by, whatever is wrong."""
     home = tmp_path / "home"
     shutil.copytree(board, home, ignore=shutil.ignore_patterns("mgn-*"))  # whose rollouts take long
     plan = tmp_path / "smoke.toml"
-    model = "stand_still" if not planted else "constant_velocity"
     plan.write_text(
         'track = "test"\ntier = "smoke"\n[[runs]]\ntasks = ["sheet_deformation"]\n'
         f'models = ["{model}"]\npreset = "smoke"\nshipped_seeds = [0]\n'
@@ -195,19 +219,30 @@ def test_the_command_fails_where_a_record_does(
     monkeypatch.setattr(campaign, "PLANS", tmp_path)
     monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=home))
     monkeypatch.setattr(record, "read_records", lambda: read_records(home))
-    if planted:
-        wrong = with_errors(read_records(home)[0], 0, 1.01)
-        write_record(wrong, home)
+    (honest,) = read_records(home)
+    write_record(plant(honest), home)
     with pytest.raises(SystemExit) as stop:
-        run(["leaderboard", "check", "--trajectories", "1", "--offset", "0", "--workers", "1", "--json"])
+        run(
+            [
+                "leaderboard",
+                "check",
+                "--trajectories",
+                "1",
+                "--offset",
+                "0",
+                "--workers",
+                "1",
+                "--json",
+                *options,
+            ]
+        )
     outcome = json.loads(capsys.readouterr().out)
-    assert (stop.value.code, outcome["ok"]) == ((1, False) if planted else (0, True))
-    assert {c["kind"] for c in outcome["compared"]} == {
-        "shipped checkpoint",
-        *(() if planted else ("trained again",)),
-    }
-    assert sum(not c["ok"] for c in outcome["compared"]) == (3 if planted else 0)
-    assert ["no record" in problem for problem in outcome["problems"]] == [True] * planted
+    assert (stop.value.code, outcome["ok"]) == ((0, True) if reason is None else (1, False))
+    assert {c["kind"] for c in outcome["compared"]} == kinds
+    differ = ["recorded and re-derived differ"] * any(not c["ok"] for c in outcome["compared"])
+    found = [*outcome["problems"], *differ]
+    assert len(found) == (reason is not None)
+    assert all(str(reason) in problem for problem in found)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 99])
