@@ -20,15 +20,17 @@ Full-rollout mean squared error per coordinate in scaled units, times 10^6 (lowe
 trajectories and the frames after the last context frame, with a 95 % bootstrap interval over seeds and trajectories.
 Of one seed the interval is over trajectories alone. Columns are numbers of context frames. *P* is the probability
 that the model's mean error at the middle one is lower than M3GN's (seeds and trajectories resampled); it is left out
-where either has fewer than three seeds. `m3gn-bench leaderboard check` re-derives samples of these numbers.
+where either has fewer than three seeds (one is enough for what does not learn). With so few seeds the bootstrap alone
+is too sure of itself; [CLAIMS.md](CLAIMS.md) asks a t-test over seeds as well. `m3gn-bench leaderboard check` re-derives
+samples of these numbers.
 """
 
 # In this order; tracks that are not named here come last.
 TRACKS = {
     "compact": "Small networks on the data of tier `paper`, each for the steps that it makes in ten minutes of one "
     "core of the machine that [pace.jsonl](plans/pace.jsonl) names ([plan](plans/compact.toml)). *Training* says how "
-    "many minutes of one core they took where they were made, or of another device that is named (for some seeds of a "
-    "row: the steps are the same anywhere); *by the clock*: the budget was minutes of that machine.",
+    "many minutes of one core they took, mean over the seeds that a CPU trained; where there are none, minutes of the "
+    "device that is named (the steps are the same anywhere). *By the clock*: the budget was minutes of that machine.",
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, for as long as one core allowed ([plan](plans/paper.toml)): "
     "not the paper's training, which took days on a GPU.",
@@ -121,8 +123,8 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
     lines = [
         "### Time per prediction",
         "",
-        "Milliseconds for a trajectory, mean over context sizes; one thread of a CPU, batches of four, while a "
-        "campaign's other processes have the other cores. Empty where all seeds were scored on a GPU.",
+        "Milliseconds for a trajectory, mean over context sizes, the least of all seeds; one thread of a CPU, batches "
+        "of four, while a campaign's other processes have the other cores. Empty where all seeds were scored on a GPU.",
         "",
         _row(["model", *(shown[name] for name in boards)]),
         _row(["---", *("--:" for _ in boards)]),
@@ -136,10 +138,12 @@ def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
 
 def _cells(row: Entry, contexts: Sequence[int], m3gn: Entry | None) -> Iterable[str]:
     minutes = row.training_minutes
-    training = f"{minutes:.0f} min, {row.training_steps:.0f} steps" if minutes else "none"
-    others = sorted({record.checkpoint.device for record in row.records} - {"cpu"})
-    if others and minutes:
-        training += f" ({', '.join(others)})"
+    took = (
+        f"{minutes:.0f} min"
+        if row.training_device == "cpu"
+        else f"{minutes:.1f} min of {row.training_device}"
+    )
+    training = f"{took}, {row.training_steps:.0f} steps" if minutes else "none"
     if any(record.checkpoint.config.training.get("minutes") for record in row.records):
         training += " (by the clock)"
     yield from (row.label, str(row.seeds), f"{row.parameters:,}".replace(",", " "), training)

@@ -108,7 +108,8 @@ def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> 
     def conditions(of: ResultRecord) -> dict[str, object]:
         trained = of.checkpoint
         where = {"device": trained.device, "threads": trained.threads, "processes": trained.processes}
-        return {"tier": of.tier, "split": of.split, "preset": of.preset} | (where if trained.steps else {})
+        by_the_clock = trained.config.training.get("minutes") is not None  # steps are the same anywhere
+        return {"tier": of.tier, "split": of.split, "preset": of.preset} | (where if by_the_clock else {})
 
     def budget(of: ResultRecord) -> dict[str, object]:
         return {name: of.checkpoint.config.training.get(name) for name in ("minutes", "steps")}

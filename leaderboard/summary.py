@@ -66,13 +66,20 @@ class Entry:
         return float(np.mean([record.checkpoint.steps for record in self.records]))
 
     @property
+    def training_device(self) -> str:
+        """What `training_minutes` are of: the CPU if any seed was trained there."""
+        devices = {record.checkpoint.device for record in self.records}
+        return "cpu" if "cpu" in devices else min(devices)
+
+    @property
     def training_minutes(self) -> float:
-        """Mean number over seeds."""
-        return float(np.mean([record.checkpoint.minutes for record in self.records]))
+        """Mean number over the seeds that were trained on `training_device`."""
+        trained = [record.checkpoint for record in self.records]
+        return float(np.mean([one.minutes for one in trained if one.device == self.training_device]))
 
     @property
     def seconds_per_prediction(self) -> float | None:
-        """Wall time of one prediction in batches, mean over seeds and contexts.
+        """Wall time of one prediction in batches, mean over contexts, the least of all seeds: other work only adds.
 
         Of one thread of a CPU only, whatever other records there are; None if there are no such.
         """
@@ -82,7 +89,7 @@ class Entry:
             if (record.evaluation_device, record.evaluation_threads) == ("cpu", 1)
         ]
         predictions = len(self.records[0].keys) * len(self.contexts)
-        return float(np.mean(alike)) / predictions if alike else None
+        return min(alike) / predictions if alike else None
 
     @cached_property
     def contexts(self) -> tuple[int, ...]:

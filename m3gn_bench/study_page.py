@@ -53,7 +53,8 @@ STABILITY_HEADER = """## Stability
 
 Every cell is *correct* (within the bound against a finer simulation), *refused* with frame, quantity and remedy,
 *bounded* (models, at the ends of their training or beyond: finite and within ten scaled units of the anchor), or
-*wrong*. Bounds: {bounds}.
+*wrong*. Bounds: {bounds}. Errors of models are relative to the displacement after the anchor, so with a context of all
+frames but one to that in the last frame.
 """
 
 
@@ -97,9 +98,10 @@ def advice(study: TradeOff) -> list[str]:
     """Three sentences: the fastest ways within budgets of error, what the reference leaves open, and models."""
     sentences: list[str] = []
     ways, before = _ways(study), None
+    open_error = study.convergence.remaining or 0  # which adds to an error, at worst
     for budget in BUDGETS:
-        able = [w for w in ways if _shown(w) and w.on_front and (w.error or 0) <= budget]
-        if not able or budget < (study.convergence.remaining or 0):
+        able = [w for w in ways if _shown(w) and w.on_front and (w.error or 0) + open_error <= budget]
+        if not able:
             sentences.append(f"within {_percent(budget)} nothing here can be shown to be")
             break
         least = min(w.seconds or 0 for w in able)
@@ -110,6 +112,8 @@ def advice(study: TradeOff) -> list[str]:
         sentences.append(f"if you can afford {_percent(budget)}, use {_name(best)} ({best.seconds:.2g} s)")
         before = best
     first = "; ".join(sentences)
+    if study.window[1] < TASKS[study.task].frames - 1:
+        first = f"in frames {study.window[0]} to {study.window[1]}: {first}"
     first = first[0].upper() + first[1:] + "."
     default, remaining = study.default, study.convergence.remaining
     second = (
@@ -134,6 +138,9 @@ def advice(study: TradeOff) -> list[str]:
     if not study.models:
         third = "No trained model took part."
     else:
+        if study.models_by is not None:
+            largest = max(m.error_of_data for m in study.models)
+            second += f" To the end of the trajectory it is up to {_percent(largest)} from fidelity {study.models_by}."
         best_model = min(study.models, key=lambda m: m.error)
         third = f"The most accurate model, {_name(best_model)}, is off by {_percent(best_model.error)}"
         if study.models_by is not None:

@@ -459,7 +459,6 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         (training(steps=None, minutes=1e-9), "minutes: "),
         (longer, "its budget is {'minutes': None, 'steps': 600}, but"),
         ({"materials": {"youngs_modulus": (10.0,)}}, "name them by a variant"),
-        (checkpoint(device="cuda"), "device is cuda, but cpu"),
         (checkpoint(config_hash="0"), "config_hash: 0, not"),
         (training(optimizer="sgd"), "configuration: none of mgn"),
         (per_timestep(-1), "frames that errors are of"),
@@ -480,6 +479,19 @@ def test_what_is_wrong_with_a_submission_is_named(
         changes = changes(submitted)
     verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
     assert any(reason in problem for problem in verdict.problems), verdict
+
+
+def test_where_it_was_trained_counts_where_budgets_are_minutes(board: Path, submitted: ResultRecord) -> None:
+    """Steps are the same on a GPU; minutes are not."""
+
+    def problems(change: Changes) -> str:
+        peers = [r.model_copy(update=change(r)) for r in read_records(board) if r.model == "mgn"]
+        record = submitted.model_copy(update={"track": "test", "seed": 1} | change(submitted))
+        on_gpu = record.checkpoint.model_copy(update={"device": "cuda"})
+        return str(submission.review(record.model_copy(update={"checkpoint": on_gpu}), peers).problems)
+
+    assert "device is cuda, but cpu" in problems(training(steps=None, minutes=1.0))
+    assert "cuda" not in problems(training(steps=3))
 
 
 @pytest.mark.parametrize(
