@@ -410,7 +410,7 @@ def _compare(records: Sequence[ResultRecord], comparison: Comparison) -> tuple[O
     cells = f"{first.errors(context).mean() * 1e6:.3g}, {second.errors(other).mean() * 1e6:.3g} | {probability:.3f}"
     seeds = min(first.seeds, second.seeds)
     if seeds < SEEDS:
-        return "not measured yet", f"{cells} (of {seeds} of {SEEDS} seeds) | "
+        return "not measured yet", f"{cells} ({seeds} of {SEEDS} seeds) | "
     by_seeds = _confidence_by_seeds(first, second, context, other, comparison.margin)
     cells += f" | {by_seeds:.3f}"
     if min(probability, by_seeds) >= CONFIDENCE:

@@ -21,8 +21,8 @@ trajectories and the frames after the last context frame, with a 95 % bootstrap 
 Of one seed the interval is over trajectories alone. Columns are numbers of context frames. *P* is the probability
 that the model's mean error at the middle one is lower than M3GN's (seeds and trajectories resampled); it is left out
 where either has fewer than three seeds (one is enough for what does not learn). With so few seeds the bootstrap alone
-is too sure of itself; [CLAIMS.md](CLAIMS.md) asks a t-test over seeds as well. `m3gn-bench leaderboard check` re-derives
-samples of these numbers.
+is too sure of itself; [CLAIMS.md](CLAIMS.md) asks a t-test over seeds as well. `m3gn-bench leaderboard check`
+re-derives samples of these numbers.
 """
 
 # In this order; tracks that are not named here come last.
