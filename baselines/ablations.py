@@ -201,8 +201,9 @@ class BayesianEncoder(ContextEncoder):
         self, latents: Tensor, pairs: Tensor, body: Body, rng: np.random.Generator | None
     ) -> Tensor:
         """A sample of z (its mean when predicting), shape [nodes + collider_nodes, latent_size]."""
-        # Sums of precisions in float32, whatever precision the network works in.
-        observations, spread = latents.float().chunk(2, dim=-1)
+        # Sums of precisions in float32 at least, whatever precision the network works in.
+        precise = torch.promote_types(latents.dtype, torch.float32)
+        observations, spread = latents.to(precise).chunk(2, dim=-1)
         variances = functional.softplus(spread) + MINIMUM_VARIANCE
         mean, variance = bayesian_aggregation(observations, variances, pair_weights(pairs))
         if rng is None:
@@ -320,6 +321,8 @@ class M3GNWithoutHistory(M3GN):
 
 class M3GNOnScaledVelocity(M3GN):
     """M3GN predicts what `scaled_velocity` leaves; shows what is hard for it and what is not (not in the paper)."""
+
+    from_rest = True  # `scaled_velocity` goes on as nodes moved last
 
     def __init__(self, task: Task, config: M3GNConfig) -> None:
         super().__init__(task, config)

@@ -212,8 +212,13 @@ class EGNO(TrajectoryModel):
         self.edge_length.fill_(float(torch.cat(lengths).double().square().mean().sqrt()))
 
     def generate(self, context: Context, rng: np.random.Generator | None) -> Tensor:
-        """Positions after the anchor, shape [horizon, nodes, dim]."""
+        """Positions after the anchor, shape [horizon, nodes, dim]. Raises ConfigError beyond the trained horizon."""
         body, path, now = context.body, context.collider_path, context.size - 1
+        if context.horizon > self.horizon:
+            raise ConfigError(
+                f"frame {context.size + self.horizon}: this egno predicts {self.horizon} frames after the anchor, not "
+                f"{context.horizon}; ask for fewer, or train it on longer trajectories"
+            )
         anchor = context.positions[-1]
         ahead = path[-1:] - path[now]
         if self.config.invariant:

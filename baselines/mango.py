@@ -124,7 +124,7 @@ class MaNGO(TrajectoryModel):
         """Positions after the anchor, shape [horizon, nodes, dim]."""
         body, path, size = context.body, context.collider_path, context.size
         anchor = context.positions[-1]
-        graph = build_graph(self.task, body, anchor[None], path[size - 1][None], _nothing(context))
+        graph = build_graph(self.task, body, anchor[None], path[size - 1][None])
         frames = torch.arange(context.frames, device=anchor.device)
         times = time_embedding(frames, size - 1).to(anchor.dtype)
         nodes = self.embed_nodes(self._node_inputs(context, times))
@@ -161,8 +161,3 @@ def _input_trajectory(context: Context) -> Tensor:
     """The context and the anchor repeated, with the collider's path, [frames, nodes + collider_nodes, dim]."""
     repeated = context.positions[-1].expand(context.horizon, -1, -1)
     return torch.cat([torch.cat([context.positions, repeated]), context.collider_path], dim=1)
-
-
-def _nothing(context: Context) -> Tensor:
-    """No further node features."""
-    return context.positions.new_zeros(1, context.body.nodes + context.body.collider_nodes, 0)

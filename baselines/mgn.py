@@ -81,17 +81,15 @@ class StepSimulator(nn.Module):
         ][: self.config.history]
         if extra is not None:
             features.append(extra.expand(moments, -1, -1))
-        nothing = state.position.new_zeros(moments, body.nodes + body.collider_nodes, 0)
-        graph = build_graph(
-            self.task, body, state.position, state.collider, torch.cat([nothing, *features], dim=-1)
-        )
+        added = torch.cat(features, dim=-1) if features else None
+        graph = build_graph(self.task, body, state.position, state.collider, added)
         return self.network(graph).unflatten(0, (moments, -1))[:, : body.nodes]
 
     def rollout(self, context: Context, velocity_scale: Tensor, extra: Tensor | None = None) -> Tensor:
         """Positions after the anchor, one step after the other, shape [horizon, nodes, dim]."""
         frames, path, body = context.positions, context.collider_path, context.body
         position = frames[-1]
-        # With two frames no earlier movement is known; scenes start at rest.
+        # With two frames no earlier movement is known: zero, as for such moments in training.
         movements = position - frames[-2], frames[-2] - frames[max(context.size - 3, 0)]
         predicted = []
         for now in range(context.size - 1, context.frames - 1):

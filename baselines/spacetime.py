@@ -22,7 +22,7 @@ def edges_at_a_time(graph: Graph, times: int, width: int) -> int:
 
 
 def temporal_encoding(numbers: Tensor, size: int) -> Tensor:
-    """Sines and cosines of numbers at wavelengths from 2 pi to 20000 pi, shape [numbers, size].
+    """Sines and cosines of numbers at wavelengths from 2 pi to almost 20000 pi, shape [numbers, size].
 
     Vaswani et al. 2017, section 3.5.
     """

@@ -187,7 +187,8 @@ class Case:
                 f"context size {size} is out of range: a trajectory of {self.frames} frames "
                 f"allows 2 to {self.frames - 1}"
             )
-        return Context(self.body, self.positions[:size], self.frames - size, self.collider_path, self.keys)
+        seen = self.positions[:size].clone()  # a view could be led back to the frames that follow
+        return Context(self.body, seen, self.frames - size, self.collider_path, self.keys)
 
     def future(self, size: int) -> Tensor:
         """The frames after a context of that size, shape [frames - size, nodes, dim]."""

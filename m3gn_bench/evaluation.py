@@ -37,7 +37,7 @@ def evaluate_model(
     starts = range(0, len(cases), batch_size)
     results: dict[int, TrajectoryErrors] = {}
     done, total = 0, len(starts) * len(context_sizes)
-    with torch.inference_mode():
+    with torch.no_grad():  # what cases remember from here must not stop a training that comes later
         for size in context_sizes:
             parts = []
             for start in starts:

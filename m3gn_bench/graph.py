@@ -76,7 +76,9 @@ def _by_group(groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return order.to(groups.device), starts.to(groups.device)
 
 
-def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, features: Tensor) -> Graph:
+def build_graph(
+    task: Task, body: Body, positions: Tensor, collider: Tensor, features: Tensor | None = None
+) -> Graph:
     """The union of one graph per moment.
 
     Args:
@@ -84,8 +86,8 @@ def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, fea
         body: the bodies.
         positions: of mesh nodes at each moment, shape [moments, nodes, dim].
         collider: of collider nodes, shape [moments, collider_nodes, dim].
-        features: what the model adds to each node, mesh nodes first, shape [moments, nodes + collider_nodes,
-            features].
+        features: what the model adds to each node if anything, mesh nodes first, shape [moments,
+            nodes + collider_nodes, features].
 
     Returns:
         A graph whose nodes are ordered by moment; in a moment, mesh nodes come first.
@@ -105,9 +107,11 @@ def build_graph(task: Task, body: Body, positions: Tensor, collider: Tensor, fea
     for kind, part in enumerate(static.split([pairs.shape[1] for pairs in edges])):
         part[:, kind] = 1
     static[: moments * body.edges.shape[1], task.edge_types :] = body.rest_vectors.repeat(moments, 1)
-    shared = shared_node_features(task, body, positions)
+    node_features = shared_node_features(task, body, positions)
+    if features is not None:
+        node_features = torch.cat([node_features, features], dim=-1)
     return Graph(
-        node_features=torch.cat([shared, features], dim=-1).flatten(0, 1),
+        node_features=node_features.flatten(0, 1),
         edge_features=torch.cat([static, world], dim=-1),
         senders=senders,
         receivers=receivers,

@@ -137,7 +137,7 @@ class TrajectorySimulator(nn.Module):
     def __init__(self, task: Task, config: PrimitivesConfig, latent_size: int) -> None:
         super().__init__()
         self.task = task
-        self.history = bool(task.m3gn_history) if config.history is None else config.history
+        self.history = task.m3gn_history if config.history is None else config.history
         self.network = MessagePassingNetwork(
             task.node_features + task.collider_features + latent_size + self.history * task.dimension,
             task.edge_features,
@@ -158,6 +158,7 @@ class TrajectorySimulator(nn.Module):
         velocity_scale: Tensor,
         displacement_scale: Tensor,
         segment: int | None = None,
+        from_rest: bool = False,
     ) -> Tensor:
         """Positions of mesh nodes after the anchor, shape [min(segment, horizon), nodes, dim].
 
@@ -166,7 +167,8 @@ class TrajectorySimulator(nn.Module):
             latent: task description, shape [nodes + collider_nodes, latent_size].
             velocity_scale, displacement_scale: units of movements and of the predicted weights.
             segment: transitions to predict, which are then the primitives' unit of time; None: all that are
-                left, in units of a whole trajectory, whatever the anchor.
+                left, in units of the whole trajectory, whatever the anchor.
+            from_rest: start the primitives with no velocity, not with the anchor's.
         """
         body, path, now = context.body, context.collider_path, context.size - 1
         unit = context.frames - 1 if segment is None else segment
@@ -187,7 +189,8 @@ class TrajectorySimulator(nn.Module):
         lower, upper = TAU_RANGE
         logits = torch.stack([of_body.mean() for of_body in outputs[:, 0].split(body.node_counts)])
         responses = self.primitives.responses(times, lower + (upper - lower) * torch.sigmoid(logits))
-        parts = (values.split(body.node_counts) for values in (weights, velocity * unit))
+        initial = torch.zeros_like(velocity) if from_rest else velocity * unit
+        parts = (values.split(body.node_counts) for values in (weights, initial))
         movements = [self.primitives.movement(*of_body) for of_body in zip(responses, *parts, strict=True)]
         return hold_fixed(context, anchor + torch.cat(movements, dim=1))
 
@@ -199,6 +202,7 @@ class M3GN(TrajectoryModel):
     preset_file = "m3gn.toml"
     config: M3GNConfig
     encoder_class: ClassVar[type[ContextEncoder]] = ContextEncoder
+    from_rest: ClassVar[bool] = False
 
     def __init__(self, task: Task, config: M3GNConfig) -> None:
         super().__init__(task, config)
@@ -208,4 +212,6 @@ class M3GN(TrajectoryModel):
     def generate(self, context: Context, rng: np.random.Generator | None) -> Tensor:
         """Positions after the anchor, shape [horizon, nodes, dim]."""
         latent = self.encoder(context, self.velocity_scale, rng)
-        return self.simulator(context, latent, self.velocity_scale, self.displacement_scale)
+        return self.simulator(
+            context, latent, self.velocity_scale, self.displacement_scale, from_rest=self.from_rest
+        )

@@ -86,11 +86,15 @@ class Model(nn.Module):
         return sum(parameter.numel() for parameter in self.parameters() if parameter.requires_grad)
 
     def prepare(self, cases: Sequence[Case]) -> None:
-        """Take statistics from the training data, before the first step."""
+        """Take statistics from the training data, before the first step. Raises ConfigError if nothing moves."""
         steps = [np.diff(c.positions[:, ~c.body.fixed].numpy(), axis=0).ravel() for c in cases]
         moved = [(c.positions - c.positions[0])[1:, ~c.body.fixed].numpy().ravel() for c in cases]
-        self.velocity_scale.fill_(float(np.concatenate(steps).std(dtype=np.float64)))
-        self.displacement_scale.fill_(float(np.concatenate(moved).std(dtype=np.float64)))
+        velocity = np.concatenate(steps).std(dtype=np.float64)
+        displacement = np.concatenate(moved).std(dtype=np.float64)
+        if self.is_learned and not velocity > 0:  # also where no node is free
+            raise ConfigError("no free node of the training trajectories moves: there is nothing to learn")
+        self.velocity_scale.fill_(float(velocity))
+        self.displacement_scale.fill_(float(displacement))
 
     def training_loss(self, case: Case, rng: np.random.Generator) -> Tensor:
         """The loss of one step on a batch of trajectories: a mean over its free nodes.

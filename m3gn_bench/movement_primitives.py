@@ -68,7 +68,7 @@ def _tabulate(functions: int, alpha: float, alpha_x: float, end: float) -> tuple
 
 
 class ProDMP(nn.Module):
-    """Movement primitives over times in [0, 1] (the unit is a whole trajectory).
+    """Movement primitives over times in [0, 1]; the unit is a whole trajectory, or a segment (`m3gn_replan`).
 
     Args:
         functions: number of basis functions.

@@ -20,6 +20,7 @@ from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case, Context, case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, Record, trajectory_key
+from m3gn_bench.errors import ConfigError
 from m3gn_bench.provenance import machine
 from m3gn_bench.studies import Cell, OnProgress, Result, Shipped, Study, distance
 from m3gn_bench.tasks import Task
@@ -243,8 +244,14 @@ def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
     given = MODEL_CELLS[name](task)
     if given.context.positions.dtype == torch.float64:
         model.double()
-    with torch.inference_mode():
-        predicted = given.usual(model.predict(given.context))
+    judged = partial(Judged, subject=checkpoint.name, cell=name, weights_sha256=description.weights_sha256)
+    try:
+        with torch.inference_mode():
+            predicted = given.usual(model.predict(given.context))
+    except ConfigError as error:
+        return judged(verdict="refused", detail=str(error))
+    if len(predicted) != given.context.horizon:
+        return judged(verdict="wrong", detail=f"{len(predicted)} frames instead of {given.context.horizon}")
     anchor = given.usual(given.context.positions[-1])
     furthest = float((predicted - anchor).abs().max())
     error = None
@@ -252,13 +259,10 @@ def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
         moved = distance(given.truth.numpy(), anchor.expand_as(given.truth).numpy())
         error = distance(predicted.numpy(), given.truth.numpy()) / moved
     finite = np.isfinite(furthest) and (error is None or np.isfinite(error))
-    return Judged(
-        subject=checkpoint.name,
-        cell=name,
+    return judged(
         verdict="bounded" if finite and furthest <= MODEL_BOUND else "wrong",
         error=error if finite else None,
         detail=f"at most {furthest:.3g} from the anchor",
-        weights_sha256=description.weights_sha256,
     )
 
 

@@ -63,7 +63,7 @@ class Task:
         has_collider: whether a rigid body with a known path takes part.
         collider_has_edges: whether it has edges of its own (a single grasping point has none).
         height_feature: whether nodes know their last coordinate, which stands for the ground.
-        m3gn_history: past velocities among the simulator's inputs in M3GN (paper's parameter counts).
+        m3gn_history: the last movement among the simulator's inputs in M3GN (paper's parameter counts).
     """
 
     name: str
@@ -79,7 +79,7 @@ class Task:
     has_collider: bool = False
     collider_has_edges: bool = False
     height_feature: bool = False
-    m3gn_history: int = 0
+    m3gn_history: bool = False
 
     @property
     def node_types(self) -> int:
@@ -130,7 +130,6 @@ def _sheet(name: str, title: str) -> Task:
         material=(MaterialFeature("youngs_modulus", 10.0, 1000.0, logarithmic=True),),
         context_sizes=(2, 5, 10),
         training_context=(2, 15),
-        m3gn_history=0,
     )
 
 
@@ -149,7 +148,6 @@ def _falling(name: str, title: str) -> Task:
         material=(MaterialFeature("youngs_modulus", 1e5, 1e6), MaterialFeature("poisson_ratio", 0.0, 0.499)),
         context_sizes=(10, 20, 30),
         training_context=(10, 50),
-        m3gn_history=0,
     )
 
 
@@ -172,7 +170,7 @@ OWN_TASKS: dict[str, Task] = {
             material=(MaterialFeature("poisson_ratio", -0.9, 0.49),),
             context_sizes=(2, 5, 10),
             training_context=(2, 15),
-            m3gn_history=1,
+            m3gn_history=True,
         ),
         Task(
             name="tissue_manipulation",
@@ -188,7 +186,7 @@ OWN_TASKS: dict[str, Task] = {
             material=(MaterialFeature("poisson_ratio", -0.9, 0.49),),  # determines Young's modulus
             context_sizes=(3, 10, 20),
             training_context=(2, 40),
-            m3gn_history=1,
+            m3gn_history=True,
         ),
         _falling("falling_teddy", "Falling Teddy Bear"),
         _falling("mixed_objects", "Mixed Objects Falling"),

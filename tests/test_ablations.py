@@ -12,6 +12,7 @@ from torch import Tensor
 
 from m3gn_bench.baselines.ablations import (
     BayesianEncoder,
+    M3GNOnScaledVelocity,
     M3GNStep,
     NodeMaximumEncoder,
     NodeMaximumTransformerEncoder,
@@ -402,6 +403,19 @@ def test_scaled_velocity_is_a_fit_by_least_squares(kind: str) -> None:
         anchor, before = new.positions[size - 1].numpy(), new.positions[size - 2].numpy()
         expected = anchor + factors[:, None, None] * (anchor - before)
         np.testing.assert_allclose(predict(model, new, size).numpy(), expected, atol=1e-5)
+
+
+@every_kind
+def test_what_starts_from_scaled_velocity_predicts_what_it_leaves(kind: str) -> None:
+    """All of it, from the first frame on: with nothing learned, the primitives add no movement of their own."""
+    cases = [make_case(kind, seed) for seed in range(3)]
+    model = build("m3gn_scaled_velocity", kind, cases)
+    assert isinstance(model, M3GNOnScaledVelocity)
+    with torch.no_grad():
+        model.simulator.network.readout.weight.zero_()
+        model.simulator.network.readout.bias[1:] = 0
+    alone = predict(build("scaled_velocity", kind, cases), cases[0], 5)
+    assert torch.allclose(predict(model, cases[0], 5), alone, atol=1e-6)
 
 
 def test_scaled_velocity_is_exact_where_all_follow_one_law_and_stands_still_where_all_rest() -> None:

@@ -26,7 +26,8 @@ from model_cases import (
 
 from m3gn_bench.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from m3gn_bench.data import Case, join
-from m3gn_bench.errors import CheckpointError
+from m3gn_bench.errors import CheckpointError, ConfigError
+from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.m3gn import M3GN, ContextConfig, ContextEncoder, TrajectorySimulator
 from m3gn_bench.model import Model, build_model, get_model_class, load_preset, model_names
 from m3gn_bench.tasks import TASKS, get_task
@@ -223,6 +224,28 @@ def test_material_reaches_only_models_that_may_see_it(name: str, kind: str) -> N
     other = replace(case, body=replace(case.body, material=case.body.material + 0.5))
     found = predict(make_model(name, kind), other, usual_size(kind))
     assert torch.equal(found, reference(name, kind)) == (name not in TOLD_MATERIAL)
+
+
+@every_kind
+@every_model
+def test_a_context_does_not_lead_to_later_frames(name: str, kind: str) -> None:
+    """Nor does a prediction spoil a case for training."""
+    made, model = make_case(kind, 3), build(name, kind, training_cases(kind))
+    case = replace(made, body=replace(made.body))  # which nobody else has used
+    seen = case.context(3).positions
+    assert seen.untyped_storage().nbytes() == seen.nbytes
+    evaluate_model(model, [case], [5])
+    if model.is_learned:
+        model.training_loss(case, np.random.default_rng(0)).backward()
+
+
+@learned_model
+def test_data_that_never_move_are_refused(name: str) -> None:
+    kind = "deformable_block"
+    case = make_case(kind, 3)
+    resting = replace(case, positions=case.positions[:1].expand(case.frames, -1, -1))
+    with pytest.raises(ConfigError, match="no free node of the training trajectories moves"):
+        build(name, kind, [resting])
 
 
 def training_batch(kind: str) -> Case:

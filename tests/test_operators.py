@@ -190,6 +190,9 @@ def test_egnos_horizon_is_fixed_and_its_tail_is_cut() -> None:
         full = model.predict(Context(case.body, case.positions[:size], horizon, path, case.keys))
     assert len(full) == horizon
     assert torch.equal(predict(model, case, size), full[: case.frames - size])
+    path = torch.cat([path, path[-1:]])
+    with pytest.raises(ConfigError, match=f"predicts {horizon} frames after the anchor, not {horizon + 1}"):
+        model.predict(Context(case.body, case.positions[:size], horizon + 1, path, case.keys))
 
 
 @every_operator
