@@ -139,7 +139,7 @@ class Context:
         positions: frames 1..T^c, scaled, shape [context_frames, nodes, dim]; the last is the anchor.
         horizon: number of frames to predict.
         collider_path: the collider's positions in all frames, shape [frames, collider_nodes, dim].
-        keys: the trajectories' names in the dataset.
+        keys: the trajectories' names in the dataset, for seeds only: their numbers tell materials.
     """
 
     body: Body
