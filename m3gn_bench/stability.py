@@ -248,8 +248,8 @@ def judge_model(task: Task, checkpoint: Shipped, name: str) -> Judged:
     try:
         with torch.inference_mode():
             predicted = given.usual(model.predict(given.context))
-    except ConfigError as error:
-        return judged(verdict="refused", detail=str(error))
+    except ConfigError as refusal:
+        return judged(verdict="refused", detail=str(refusal))
     if len(predicted) != given.context.horizon:
         return judged(verdict="wrong", detail=f"{len(predicted)} frames instead of {given.context.horizon}")
     anchor = given.usual(given.context.positions[-1])
