@@ -43,9 +43,10 @@ that does not appear here may still hold for the paper's networks and data. In p
   to 2400 steps in the ten minutes in which M3GN makes 8700 to 15 800. On a GPU, as in the paper, a step of theirs costs
   no more than one of M3GN's (on Tissue Manipulation 1500 to 3000 per minute were made there, and 1600 to 1800 of M3GN).
 - **Trials.** Every method of the compact track had three of its learning rate, each two minutes of the machine's clock
-  ([plan](plans/tuning.toml)); ablations have the rates of what they are ablations of. MeshGraphNets had sixteen of
-  their noise ([plan](plans/noise.toml)), M3GN four of the last movement as a feature on falling bodies
-  ([plan](plans/falling.toml)). That M3GN reads one or two context pairs per step comes from
+  ([plan](plans/tuning.toml)), which tell differences above a tenth at best: six that were repeated would have chosen
+  other rates ([numbers](../docs/performance.md)). Ablations have the rates of what they are ablations of.
+  MeshGraphNets had sixteen of their noise ([plan](plans/noise.toml)), M3GN four of the last movement as a feature on
+  falling bodies ([plan](plans/falling.toml)). That M3GN reads one or two context pairs per step comes from
   [experiments](../docs/performance.md), which on Sheet Deformation speak for all pairs instead.
 - **Not tried** were MaNGO's and EGNO's depth (three blocks; the others have five) and width on falling bodies (32
   instead of 64, for their memory), and where models with movement primitives start from (tau = 0.5).
