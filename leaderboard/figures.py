@@ -36,7 +36,7 @@ def draw_board(records: Sequence[ResultRecord], track: str, task: str) -> "Figur
     rows = [row for row in entries(records, track, task) if row.label in STYLES]
     if not rows:
         return None
-    figure = Figure(figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(11, 4), layout="constrained")
     over_context, over_time = figure.subplots(1, 2)
     at = middle(rows[0].contexts)
     for row in rows:
@@ -52,7 +52,7 @@ def draw_board(records: Sequence[ResultRecord], track: str, task: str) -> "Figur
         title=titles(records)[task],
     )
     over_time.set(yscale="log", xlabel="frame", ylabel="MSE of the frame", title=f"after {at} context frames")
-    over_context.legend(fontsize=8)
+    figure.legend(*over_context.get_legend_handles_labels(), fontsize=8, loc="outside right center")
     for axes in (over_context, over_time):
         axes.grid(alpha=0.3)
     return figure
