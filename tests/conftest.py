@@ -1,4 +1,4 @@
-"""Fixtures that several test files share. The one real dataset is generated once per process of a test run."""
+"""Fixtures that several test files share. The one real dataset is generated once."""
 
 import os
 
@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from skfem import MeshTet
 
 from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, SPLITS, Metadata, Tier, trajectory_key
@@ -129,5 +130,9 @@ def tetra_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The smoke tier of Sheet Deformation, simulated in this process. Copy it before damaging it."""
-    return generate(get_scene("sheet_deformation"), "smoke", tmp_path_factory.mktemp("data")).file
+    """The smoke tier of Sheet Deformation, which all processes of a test run share. Copy it before damaging it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    with FileLock(folder / "smoke.lock"):
+        return generate(get_scene("sheet_deformation"), "smoke", folder / "smoke").file

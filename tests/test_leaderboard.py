@@ -199,6 +199,7 @@ def test_what_a_record_says_wrongly_of_itself_is_found(
 )
 def test_the_command_fails_where_a_record_does(
     board: Path,
+    smoke_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -217,6 +218,8 @@ def test_the_command_fails_where_a_record_does(
         f'models = ["{model}"]\npreset = "smoke"\nshipped_seeds = [0]\n'
     )
     monkeypatch.setattr(campaign, "PLANS", tmp_path)
+    if reason is not None:  # else the data are made for training, too, as users have it
+        monkeypatch.setattr(sources, "find_or_generate", lambda *_, **__: smoke_file)
     monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=home))
     monkeypatch.setattr(record, "read_records", lambda: read_records(home))
     (honest,) = read_records(home)

@@ -49,10 +49,8 @@ def agree(shown: str, printed: str) -> bool:
     return all(there == pytest.approx(here, rel=tolerance) for here, there in pairs)
 
 
-@pytest.fixture(scope="module")
-def carried_out(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str, str]]]:
-    """The folder, and what the tutorial runs, says is printed and what was printed."""
-    folder = tmp_path_factory.mktemp("first-model")
+def carry_out(folder: Path) -> list[tuple[str, str, str]]:
+    """What the tutorial runs in a folder, says is printed, and what was printed."""
     scripts = Path(sys.executable).parent
     environment = {name: value for name, value in os.environ.items() if name != "M3GN_BENCH_DATA"}
     environment["PATH"] = f"{scripts}{os.pathsep}{environment['PATH']}"
@@ -73,25 +71,20 @@ def carried_out(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tu
         )
         assert ran.returncode == 0, f"{content}\n{ran.stderr}"
         done.append((content, "", ran.stdout))
-    return folder, done
+    return done
 
 
-def test_prints_what_it_says(carried_out: tuple[Path, list[tuple[str, str, str]]]) -> None:
-    for command, shown, printed in carried_out[1]:
+def test_does_what_it_says(tmp_path: Path) -> None:
+    for command, shown, printed in carry_out(tmp_path):
         assert shown, f"the tutorial does not say what this prints: {command}"
         for line in shown.splitlines():
             assert any(agree(line, other) for other in printed.splitlines()), f"{line}\nnot in\n{printed}"
 
+    assert (tmp_path / "models.png").read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in tmp_path.iterdir()} == {"board", "data", "models.png", "plan.toml", "runs"}
 
-def test_leaves_what_it_says(carried_out: tuple[Path, list[tuple[str, str, str]]]) -> None:
-    folder = carried_out[0]
-    assert (folder / "models.png").read_bytes().startswith(b"\x89PNG")
-    assert {path.name for path in folder.iterdir()} == {"board", "data", "models.png", "plan.toml", "runs"}
-
-
-def test_the_model_learned_what_it_says(carried_out: tuple[Path, list[tuple[str, str, str]]]) -> None:
-    """Less than half the error of standing still, and less the more frames it sees."""
-    records = {record.model: record for record in read_records(carried_out[0] / "board")}
+    # The model learned: less than half the error of standing still, and less the more frames it sees.
+    records = {record.model: record for record in read_records(tmp_path / "board")}
     trained, still = records["m3gn"].results, records["stand_still"].results
     assert all(ours.mse < theirs.mse / 2 for ours, theirs in zip(trained, still, strict=True))
     assert trained[0].mse > trained[1].mse > trained[2].mse
