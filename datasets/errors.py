@@ -1,5 +1,10 @@
 """The root of all errors that a user may see: one clear line, no traceback."""
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
 
 class BenchError(Exception):
     """Something the user can act on. The message says what was wrong, where, and what to do."""
@@ -10,6 +15,12 @@ class BenchError(Exception):
 
 class DatasetError(BenchError):
     """A dataset file cannot be written, opened or trusted."""
+
+
+def first_problem(error: "ValidationError") -> str:
+    """What pydantic found first, in a line: where, and what."""
+    first = error.errors()[0]
+    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
 
 
 def unknown_name(kind: str, name: str, known: list[str]) -> str:

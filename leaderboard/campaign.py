@@ -15,7 +15,7 @@ A plan is a TOML file. Its head names the board and the data; every table `[[run
     shipped_seeds = [0]         # whose checkpoints are kept beside the records
     preset = "compact"          # default
     minutes = 10                # of one core for training; or steps = 1000; neither for models that do not learn
-    variant = "large rate"      # what is different here, if anything
+    variant = "large rate"      # what is different here; needed with settings or materials
     settings = { "training.learning_rate" = 4e-3 }
     materials = { youngs_modulus = [10, 1000] }  # only trajectories of these, in all splits
 """
@@ -27,14 +27,14 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, NonNegativeInt, ValidationError, model_validator
 
 from m3gn_bench.checkpoint import copy_checkpoint
 from m3gn_bench.data import Materials, load_cases
-from m3gn_bench.datasets.errors import BenchError
-from m3gn_bench.datasets.file import content_hash, open_file, read_metadata
+from m3gn_bench.datasets.errors import BenchError, first_problem
+from m3gn_bench.datasets.file import content_hash, open_file
 from m3gn_bench.datasets.schema import TIERS, Record, Split
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.pace import Pace, read_pace
@@ -51,6 +51,7 @@ from m3gn_bench.leaderboard.scoring import score
 from m3gn_bench.model import RunConfig, build_model, load_preset
 from m3gn_bench.tasks import get_task
 from m3gn_bench.training import require_budget, train
+from m3gn_bench.version import __version__
 
 PLANS = Path(__file__).parent / "plans"
 State = Literal["done", "outdated", "to do"]
@@ -61,7 +62,7 @@ class Grid(Record):
 
     tasks: tuple[str, ...] = Field(min_length=1)
     models: tuple[str, ...] = Field(min_length=1)
-    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    seeds: tuple[NonNegativeInt, ...] = Field(default=(0,), min_length=1)
     shipped_seeds: tuple[int, ...] = ()
     preset: str = "compact"
     minutes: float | None = None
@@ -69,6 +70,13 @@ class Grid(Record):
     variant: Variant = ""
     settings: dict[str, Any] = Field(default={})
     materials: Materials = Field(default={})
+
+    @model_validator(mode="after")
+    def _ships_what_it_makes(self) -> Self:
+        missing = sorted({*self.shipped_seeds} - {*self.seeds})
+        if missing:
+            raise ValueError(f"shipped_seeds: {missing[0]} is none of seeds")
+        return self
 
 
 class Plan(Record):
@@ -126,8 +134,7 @@ def read_plan(path: Path) -> list[PlannedRun]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"cannot read {path}: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise ConfigError(f"{path}: {first_problem(error)}") from error
     if plan.tier not in TIERS:
         raise ConfigError(f"{path}: tier: unknown {plan.tier!r}; known: {', '.join(TIERS)}")
     pace = None if plan.pace is None else read_pace(path.parent / plan.pace)
@@ -159,6 +166,11 @@ def _planned(plan: Plan, pace: Pace | None, grid: Grid, task_name: str, model: s
     settings = grid.settings | {key: value for key, value in budget.items() if value is not None}
     config = load_preset(model, grid.preset, task, settings)
     require_budget(config, build_model(config, task).is_learned)
+    usual = load_preset(model, grid.preset, task)
+    if not grid.variant and (grid.materials or config.hash() != usual.hash()):
+        raise ConfigError(
+            f"{model} is not that of preset {grid.preset!r} on all data; name what differs by a variant"
+        )
     if grid.shipped_seeds and grid.variant:
         raise ConfigError(
             "checkpoints of a variant cannot ship: their folders are named by model, preset and seed"
@@ -233,17 +245,13 @@ def carry_out(job: Job) -> Outcome:
     folder = job.runs / run.track / run.task
     try:
         with open_file(job.dataset) as file:
-            version = read_metadata(file).dataset_version
             dataset_hash = content_hash(file, run.tier, ("train", "validation"))
         training, validation = (
             load_cases(job.dataset, task, split, run.tier, run.materials) for split in ("train", "validation")
         )
-        # An older run of that name, with other settings or data, is no obstacle.
-        budget = run.config.training
-        stamp = f"{run.config.hash()[:8]}-{budget.minutes or budget.steps or 0:g}-{version}"
-        if run.materials:
-            stamp += f"-{hashlib.sha256(json.dumps(run.materials).encode()).hexdigest()[:8]}"
-        folder /= f"{run.name}-{stamp}"
+        # An older run of that name, with anything else than these, is no obstacle.
+        own = [run.config.to_json(), run.materials, dataset_hash, job.device, __version__]
+        folder /= f"{run.name}-{hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:8]}"
         train(
             run.config,
             task,
@@ -252,6 +260,7 @@ def carry_out(job: Job) -> Outcome:
             folder,
             seed=run.seed,
             dataset_hash=dataset_hash,
+            materials=run.materials,
             device=job.device,
         )
         record = score(
@@ -261,7 +270,6 @@ def carry_out(job: Job) -> Outcome:
             tier=run.tier,
             split=run.split,
             variant=run.variant,
-            materials=run.materials,
             ships=run.ships,
             device=job.device,
         )

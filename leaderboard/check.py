@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 
 from m3gn_bench.checkpoint import load_checkpoint
+from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import Record
-from m3gn_bench.errors import CheckpointError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.campaign import Outcome
 from m3gn_bench.leaderboard.consistency import contradictions
@@ -91,7 +91,7 @@ def check_records(
             continue
         try:
             model, description = load_checkpoint(folder)
-        except CheckpointError as error:
+        except BenchError as error:
             problems.append(f"{where}: {error}")
             continue
         if description != record.checkpoint:
@@ -154,8 +154,9 @@ def compare_with_retrained(records: Sequence[ResultRecord], again: Sequence[Outc
                 )
                 for index, both in enumerate(errors)
             ]
-            over_time = stated[result.context].per_timestep_mse, result.per_timestep_mse
-            if not np.allclose(*over_time, rtol=TOLERANCES["trained again"], atol=0):
+            before, now = stated[result.context].per_timestep_mse, result.per_timestep_mse
+            same_length = len(before) == len(now)
+            if not same_length or not np.allclose(before, now, rtol=TOLERANCES["trained again"], atol=0):
                 problems.append(f"{where}, context {result.context}: the error over time is another one")
     return CheckReport.of(compared, problems)
 

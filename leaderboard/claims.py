@@ -443,18 +443,25 @@ def _confidence_by_seeds(first: Entry, second: Entry, context: int, other: int, 
 
 def _compare_times(first: Entry, second: Entry) -> tuple[Outcome, str]:
     """Only times that the same machine took are compared; seeds make no difference."""
-    shared = {record.machine for record in first.records} & {record.machine for record in second.records}
-    times = []
-    for row in (first, second):
-        of_machine = tuple(record for record in row.records if record.machine in shared)
-        times.append(Entry(of_machine).seconds_per_prediction if of_machine else None)
-    ours, theirs = times
-    if ours is None or theirs is None:
+    one, other = (_seconds_by_machine(row) for row in (first, second))
+    shared = one.keys() & other.keys()
+    if not shared:
         return "not measured yet", " | | "
+    ours, theirs = min((one[machine], other[machine]) for machine in shared)
     # Times differ by a third from one minute to the next on a shared machine.
     clear = max(ours, theirs) > 1.5 * min(ours, theirs)
     outcome: Outcome = "undecided" if not clear else "holds" if ours < theirs else "contradicted"
     return outcome, f"{ours:.3g}, {theirs:.3g} | | "
+
+
+def _seconds_by_machine(row: Entry) -> dict[str, float]:
+    found = {
+        machine: Entry(
+            tuple(record for record in row.records if record.machine == machine)
+        ).seconds_per_prediction
+        for machine in {record.machine for record in row.records}
+    }
+    return {machine: seconds for machine, seconds in found.items() if seconds is not None}
 
 
 def _verdict(claim: Claim, compared: Sequence[tuple[Outcome, str]]) -> str:

@@ -2,9 +2,8 @@
 
 from pydantic import ValidationError
 
-from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.errors import BenchError, unknown_name
 from m3gn_bench.datasets.schema import SPLITS, TIERS, as_split
-from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.model import RunConfig, build_model, model_names
 from m3gn_bench.sources import dataset_version, number_of_trajectories, trajectory_names
@@ -32,6 +31,7 @@ def contradictions(record: ResultRecord) -> list[str]:
             (described.task, described.config.model_name, described.config.preset, described.seed),
             (record.task, record.model, record.preset, record.seed),
         ),
+        "materials": (record.materials, described.materials),
         "dataset version": (record.dataset_version, dataset_version(task)),
         "context sizes": (tuple(result.context for result in record.results), task.context_sizes),
         "frames that errors are of": (sorted(frames), [task.frames]),
@@ -52,7 +52,7 @@ def _of_the_configuration(record: ResultRecord) -> list[str]:
     try:
         config = RunConfig.from_json(described.config.model_dump())
         model = build_model(config, TASKS[record.task])
-    except (ConfigError, ValidationError) as error:
+    except (BenchError, ValidationError) as error:
         return [f"configuration: none of {record.model}: {error}"]
     found = []
     if config.hash() != described.config_hash:

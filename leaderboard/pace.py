@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.errors import ConfigError
@@ -32,12 +32,10 @@ class Pace:
 
     Attributes:
         path: of the file.
-        machine: which one.
         steps_per_minute: by preset, task and model.
     """
 
     path: Path
-    machine: str
     steps_per_minute: Mapping[tuple[str, str, str], float]
 
     def steps(self, preset: str, task: str, model: str, minutes: float) -> int:
@@ -59,7 +57,7 @@ def read_pace(path: Path) -> Pace:
     """
     try:
         lines = [Measured.model_validate(json.loads(line)) for line in path.read_text().splitlines()]
-    except (OSError, ValueError, ValidationError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read the pace of models in {path}: {error}") from error
     machines = {line.machine for line in lines}
     if len(machines) != 1:
@@ -69,4 +67,4 @@ def read_pace(path: Path) -> Pace:
         for line in lines
         for model, pace in line.steps_per_minute.items()
     }
-    return Pace(path, machines.pop(), paces)
+    return Pace(path, paces)

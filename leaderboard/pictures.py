@@ -11,7 +11,6 @@ from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder
-from m3gn_bench.leaderboard.summary import middle
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.picture_geometry import surface, wireframe
 from m3gn_bench.tasks import Task
@@ -34,6 +33,9 @@ def draw_overlays(
         task: what to predict.
         dataset, tier: where the test trajectories are.
         home: the leaderboard's folder, with the checkpoints.
+
+    Raises:
+        CheckpointError: a checkpoint that is missing or damaged.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection, PolyCollection
@@ -41,7 +43,7 @@ def draw_overlays(
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    context = middle(task.context_sizes)
+    context = task.middle_context
     judge = next(record for record in records if record.model == "m3gn")
     result = judge.result(context)
     assert result is not None

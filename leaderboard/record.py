@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from m3gn_bench.checkpoint import Checkpoint
 from m3gn_bench.data import Materials
-from m3gn_bench.datasets.errors import BenchError
+from m3gn_bench.datasets.errors import BenchError, first_problem
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.metrics import TrajectoryErrors
@@ -189,12 +189,13 @@ def read_record(path: Path) -> ResultRecord:
     try:
         return ResultRecord.model_validate_json(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
+        problem = first_problem(error)
         stated = re.search(rb'"record_schema": *(\d+)', content)
         if stated is not None and int(stated[1]) != RECORD_SCHEMA:
-            place = f"its record_schema is {int(stated[1])}, and this version reads {RECORD_SCHEMA}; {place}"
-        raise BenchError(f"{path} is no valid result record: {place}: {first['msg']}") from error
+            problem = (
+                f"its record_schema is {int(stated[1])}, and this version reads {RECORD_SCHEMA}; {problem}"
+            )
+        raise BenchError(f"{path} is no valid result record: {problem}") from error
 
 
 def read_records(home: Path = HOME) -> list[ResultRecord]:

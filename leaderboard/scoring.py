@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from m3gn_bench.checkpoint import load_checkpoint, read_description
-from m3gn_bench.data import Materials, load_cases
+from m3gn_bench.data import load_cases
 from m3gn_bench.datasets.file import content_hash, open_file, read_metadata, stored_hashes
 from m3gn_bench.datasets.schema import Split
 from m3gn_bench.evaluation import evaluate_model
@@ -27,12 +27,11 @@ def score(
     split: Split = "test",
     contexts: Sequence[int] | None = None,
     variant: str = "",
-    materials: Materials | None = None,
     ships: bool = False,
     device: str = "cpu",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResultRecord:
-    """The record of a checkpoint's errors on a split of the data.
+    """The record of a checkpoint's errors on a split of the data, and there on the materials that it was trained on.
 
     Args:
         checkpoint: folder of a finished training run.
@@ -41,7 +40,6 @@ def score(
         tier, split: which trajectories.
         contexts: numbers of context frames; the task's own if None.
         variant: what differs from the model's preset, in a word.
-        materials: only trajectories of these materials.
         ships: whether the checkpoint is kept beside the records.
         device: of torch, that predicts.
         on_progress: called with (done, total) after every batch.
@@ -59,7 +57,7 @@ def score(
     model, described = load_checkpoint(checkpoint, task)
     where = usable_device(device)
     model.to(where)
-    cases = [case.to(where) for case in load_cases(dataset, task, split, tier, materials)]
+    cases = [case.to(where) for case in load_cases(dataset, task, split, tier, described.materials)]
     start = time.perf_counter()
     errors = evaluate_model(model, cases, contexts or task.context_sizes, on_progress)
     seconds = time.perf_counter() - start
@@ -70,7 +68,7 @@ def score(
         model=described.config.model_name,
         preset=described.config.preset,
         variant=variant,
-        materials=materials or {},
+        materials=described.materials,
         seed=described.seed,
         parameters=model.parameter_count(),
         tier=tier,

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from m3gn_bench.datasets.schema import IMPORTED, Record
+from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.consistency import contradictions
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
 from m3gn_bench.model import load_preset, model_names
@@ -28,6 +29,9 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         replace: whether it may take the place of the record of that name.
     """
     problems, remarks = [], []
+    if replace:
+        taken = find_record(board, record.track, record.task, record.name)
+        board = [peer for peer in board if peer is not taken]
     if record.record_schema != RECORD_SCHEMA:
         problems.append(
             f"record_schema is {record.record_schema}, not {RECORD_SCHEMA}: make it with this version"
@@ -38,7 +42,7 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
     on_same_split = any((peer.track, peer.split) == (record.track, record.split) for peer in board)
     if record.split != "test" and not on_same_split:  # tracks of trials are of the validation split
         problems.append(f"split is {record.split!r}, but boards are of the test split")
-    if find_record(board, record.track, record.task, record.name) is not None and not replace:
+    if find_record(board, record.track, record.task, record.name) is not None:
         problems.append(
             f"there is a record of {record.task}/{record.name} already; give --replace to replace it"
         )
@@ -53,6 +57,10 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         )
     if record.package_version != __version__:
         remarks.append(f"it was made with version {record.package_version}, not {__version__}")
+
+    for what, made_by in (("trained", record.checkpoint.commit), ("scored", record.commit)):
+        if made_by is not None and made_by.endswith("+changes"):
+            remarks.append(f"it was {what} by code with changes that no commit holds ({made_by})")
 
     problems += _unequal_conditions(record, board)
     remarks += _long_training(record, board)
@@ -87,19 +95,40 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
 
 
 def _is_of_preset(record: ResultRecord) -> bool:
-    usual = load_preset(record.model, record.preset, get_task(record.task))
+    try:
+        usual = load_preset(record.model, record.preset, get_task(record.task))
+    except ConfigError:  # no such preset
+        return False
     return record.checkpoint.config_hash == usual.hash()
 
 
 def _long_training(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
-    beside = [peer for peer in board if (peer.track, peer.task) == (record.track, record.task)]
-    longest = max((peer.checkpoint.minutes for peer in beside), default=0.0)
-    if longest and record.checkpoint.minutes > LONG * longest:
-        return [
-            f"it was trained for {record.checkpoint.minutes:.3g} minutes, the others of its board for {longest:.3g} at "
-            "most: is its machine so much slower?"
-        ]
-    return []
+    """What is not equal where steps are counted and minutes are not."""
+    own = record.checkpoint
+    others = [
+        peer.checkpoint
+        for peer in board
+        if (peer.track, peer.task) == (record.track, record.task) and peer.checkpoint.steps
+    ]
+    if not own.steps or not others:
+        return []
+    remarks = []
+    longest, most = (max(getattr(peer, what) for peer in others) for what in ("minutes", "steps"))
+    if own.minutes > LONG * longest:
+        remarks.append(
+            f"it was trained for {own.minutes:.3g} minutes, the others of its board for {longest:.3g} at most: is its "
+            "machine so much slower?"
+        )
+    if own.steps > LONG * most:
+        remarks.append(
+            f"it was trained for {own.steps} steps, the others of its board for {most} at most: are its steps so much "
+            "cheaper?"
+        )
+    elif own.device not in {peer.device for peer in others}:
+        remarks.append(
+            f"it was trained on {own.device}, so its minutes say nothing: are {own.steps} steps a fair budget?"
+        )
+    return remarks
 
 
 def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:

@@ -107,9 +107,9 @@ class Entry:
         place = {key: number for number, key in enumerate(self.records[0].keys)}
         return errors[:, [place[key] for key in self.keys]]
 
-    def estimate(self, context: int, free_nodes: bool = False) -> Estimate:
+    def estimate(self, context: int) -> Estimate:
         """Mean error at a context size and its interval."""
-        errors = self.errors(context, free_nodes)
+        errors = self.errors(context)
         low, high = np.percentile(bootstrap_means([errors]), [2.5, 97.5])
         return Estimate(float(errors.mean()), float(low), float(high))
 

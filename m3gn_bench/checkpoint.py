@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import safetensors
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from m3gn_bench.data import Materials
+from m3gn_bench.datasets.errors import first_problem
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import CheckpointError
@@ -38,6 +40,7 @@ class Checkpoint(Record):
         minutes: training time (on a CPU: CPU time of training steps).
         validation_error: mean full-rollout MSE over context sizes of the kept weights; None if not trained.
         dataset_hash: content hash of the data trained on (training and validation split).
+        materials: only the trajectories of these materials were trained on.
         processes: how many trained it together, each with a device and threads of its own.
         commit: of the code that finished its training, if that ran from a checkout.
     """
@@ -51,6 +54,7 @@ class Checkpoint(Record):
     minutes: float
     validation_error: float | None
     dataset_hash: str
+    materials: Materials = Field(default={})
     device: str
     threads: int
     processes: int = 1
@@ -83,9 +87,7 @@ def read_description(folder: Path) -> Checkpoint:
     try:
         return Checkpoint.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise CheckpointError(f"{path} is damaged: {place}: {first['msg']}") from error
+        raise CheckpointError(f"{path} is damaged: {first_problem(error)}") from error
 
 
 def load_checkpoint(folder: Path, task: Task | None = None) -> tuple[Model, Checkpoint]:
@@ -97,6 +99,8 @@ def load_checkpoint(folder: Path, task: Task | None = None) -> tuple[Model, Chec
 
     Raises:
         CheckpointError: missing, damaged, or made for another version of the model.
+        ConfigError: no such model.
+        PluginError: the package of its model or task cannot be imported.
     """
     description = read_description(folder)
     path = folder / WEIGHTS

@@ -69,11 +69,11 @@ class Report:
         if self.as_json:
             click.echo(json.dumps(_finite(record), indent=2, allow_nan=False))
             return
-        console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=not sys.stdout.isatty())
+        shown = sys.stdout.isatty()
+        # Units in brackets are no markup.
+        console = Console(width=None if shown else 160, soft_wrap=not shown, markup=False, emoji=False)
         for text in texts:
-            console.print(text, highlight=False, markup=False) if isinstance(text, str) else console.print(
-                text
-            )
+            console.print(text, highlight=False)
 
     @contextmanager
     def progress(self, description: str) -> Iterator[OnProgress]:

@@ -73,7 +73,7 @@ def examine(data: Path, self_test: bool, on_progress: Callable[[int, int], None]
 
 def machine() -> Iterator[Finding]:
     """The processor and the programs that everything runs on."""
-    from m3gn_bench.generators.generate import machine as processor
+    from m3gn_bench.provenance import machine as processor
 
     yield Finding(part="machine", name="m3gn-bench", state="fine", detail=__version__)
     yield Finding(part="machine", name="Python", state="fine", detail=platform.python_version())
@@ -231,7 +231,7 @@ def simulations() -> Iterator[Finding]:
 
 
 def predictions() -> Iterator[Finding]:
-    """One trajectory of every task with a shipped M3GN, predicted and compared with the record."""
+    """One trajectory of every M3GN that ships, predicted and compared with the record."""
     from m3gn_bench.leaderboard.check import CheckReport, check_records, check_statements
     from m3gn_bench.leaderboard.record import read_records
 

@@ -29,6 +29,7 @@ def evaluate_model(
 
     Raises:
         ConfigError: a context size that the trajectories do not allow.
+        DatasetError: trajectories that this model cannot predict, such as those of other meshes than it remembers.
     """
     was_training = model.training
     model.eval()

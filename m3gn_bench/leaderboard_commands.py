@@ -43,9 +43,12 @@ def show(task_name: str | None, as_json: bool) -> None:
     records = [r for r in read_records() if task_name in (None, r.task)]
     rows: list[list[object]] = [
         [
+            r.track,
             r.task,
+            r.split,
             r.model,
             r.preset,
+            r.variant,
             r.seed,
             result.context,
             f"{result.mse * 1e6:.4g}",
@@ -58,7 +61,7 @@ def show(task_name: str | None, as_json: bool) -> None:
         {"records": [record.model_dump(mode="json") for record in records]},
         table(
             "Full-rollout MSE x 1e6",
-            ["task", "model", "preset", "seed", "context", "mse", "free nodes"],
+            ["track", "task", "split", "model", "preset", "variant", "seed", "context", "mse", "free nodes"],
             rows,
         ),
     )

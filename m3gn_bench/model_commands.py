@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from m3gn_bench.console import DATA, DEVICE, JSON, WORKERS, Report, table
 
@@ -140,15 +141,13 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     """Values of --set, in TOML's notation."""
     values: dict[str, Any] = {}
     for setting in settings:
-        key, equals, text = setting.partition("=")
+        key, _, text = setting.partition("=")
         try:
             (values[key.strip()],) = tomllib.loads(f"value = {text}").values()
-        except (tomllib.TOMLDecodeError, ValueError):
+        except ValueError:
             raise click.BadParameter(
                 f"{setting!r} is no KEY=VALUE with a TOML value, e.g. training.learning_rate=1e-3"
             ) from None
-        if not equals:
-            raise click.BadParameter(f"{setting!r} has no '='")
     return values
 
 
@@ -190,7 +189,9 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
 @WORKERS
 @DATA
 @JSON
+@click.pass_context
 def evaluate(
+    invoked: click.Context,
     model: str,
     task_name: str | None,
     tier: str,
@@ -219,7 +220,14 @@ def evaluate(
     from m3gn_bench.datasets.file import open_file, read_splits
     from m3gn_bench.datasets.schema import as_split
     from m3gn_bench.errors import CheckpointError, ConfigError
-    from m3gn_bench.leaderboard.record import checkpoint_folder, find_record, read_records, write_record
+    from m3gn_bench.leaderboard.record import (
+        Name,
+        Variant,
+        checkpoint_folder,
+        find_record,
+        read_records,
+        write_record,
+    )
     from m3gn_bench.leaderboard.scoring import score
     from m3gn_bench.metrics import confidence_interval
     from m3gn_bench.model import get_model_class, model_names
@@ -233,6 +241,10 @@ def evaluate(
     get_model_class(model)
     part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
+    _require_part_of_a_file_name("--track", track, Name, "letters, digits and any of . - _")
+    _require_part_of_a_file_name(
+        "--variant", variant, Variant, "letters, digits, spaces and any of . + = - _"
+    )
     if record_home is not None and (part != "test" or sizes is not None):
         raise ConfigError("--record takes the test split at the task's own context sizes")
     if record_home is not None and dataset is not None:
@@ -243,6 +255,12 @@ def evaluate(
             raise CheckpointError(f"{checkpoint} holds a {described.config.model_name}, not a {model}")
         if task_name not in (None, described.task):
             raise CheckpointError(f"{checkpoint} was trained on {described.task}, not on {task_name}")
+        for name, asked, held in (
+            ("preset", preset, described.config.preset),
+            ("seed", seed, described.seed),
+        ):
+            if invoked.get_parameter_source(name) is ParameterSource.COMMANDLINE and asked != held:
+                raise CheckpointError(f"{checkpoint} is of {name} {held}, not of {asked}")
         folders = {described.task: checkpoint}
     else:
         names = list(TASKS) if task_name is None else [get_task(task_name).name]
@@ -363,20 +381,12 @@ def evaluate(
 
 def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: str, variant: str) -> None:
     """Raises ConfigError if a record would replace another, or pass for one of the model's preset and is not."""
-    from pydantic import TypeAdapter, ValidationError
-
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.errors import ConfigError
-    from m3gn_bench.leaderboard.record import Variant, find_record, run_name
+    from m3gn_bench.leaderboard.record import find_record, run_name
     from m3gn_bench.model import load_preset
     from m3gn_bench.tasks import get_task
 
-    try:
-        TypeAdapter(Variant).validate_python(variant)
-    except ValidationError:
-        raise ConfigError(
-            f"--variant {variant!r}: letters, digits, spaces and any of . + = - _ make file names"
-        ) from None
     found = read_description(folder)
     config = found.config
     name = run_name(config.model_name, config.preset, variant, found.seed)
@@ -391,6 +401,18 @@ def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: st
             f"{folder} was trained with other settings than preset {config.preset!r} has; name what differs with "
             "--variant"
         )
+
+
+def _require_part_of_a_file_name(option: str, value: str, kind: object, allowed: str) -> None:
+    """Raises ConfigError if a track or a variant has characters that such names do not have."""
+    from pydantic import TypeAdapter, ValidationError
+
+    from m3gn_bench.errors import ConfigError
+
+    try:
+        TypeAdapter(kind).validate_python(value)
+    except ValidationError:
+        raise ConfigError(f"{option} {value!r}: {allowed} make file names") from None
 
 
 def _is_shipped(checkpoint: Path, home: Path) -> bool:

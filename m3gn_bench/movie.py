@@ -76,7 +76,7 @@ def mp4(images: Iterator[Pixels], fps: int) -> bytes:
             assert process.stdin is not None
             with suppress(BrokenPipeError):  # it has ended, and says why
                 for image in chain([first], images):
-                    process.stdin.write(np.ascontiguousarray(image).tobytes())
+                    process.stdin.write(image.tobytes())
                 process.stdin.close()
         if process.returncode:
             raise ConfigError(f"ffmpeg could not write the .mp4: {messages.read_text(errors='replace')}")

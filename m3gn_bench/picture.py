@@ -137,7 +137,7 @@ class Picture:
         return gif(_counted(pixels, frames, on_progress), samples, fps)
 
     def mp4(self, frames: Sequence[int], fps: int, on_progress: Callable[[int, int], None]) -> bytes:
-        """An MP4 of the frames. Raises ConfigError where PyAV is missing."""
+        """An MP4 of the frames. Raises ConfigError where ffmpeg is missing, or fails."""
         return mp4(_counted(self._animated(), frames, on_progress), fps)
 
     def _animated(self) -> Callable[[int], Pixels]:

@@ -9,7 +9,10 @@ from pathlib import Path
 
 @cache  # what a process has imported stays what it was when it was asked first
 def commit() -> str | None:
-    """The commit of the checkout that this code runs from, marked if files differ; None if installed."""
+    """The commit of the checkout that this code runs from, marked if files that it has differ.
+
+    None if the package is installed, or there is no git.
+    """
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").is_file():
         return None

@@ -289,15 +289,11 @@ def _map(case: Case, change: "Callable[[torch.Tensor], torch.Tensor]") -> Case:
     return Case(body, change(case.positions), change(case.collider_path), case.keys)
 
 
-def _middle(task: Task) -> int:
-    return task.context_sizes[len(task.context_sizes) // 2]
-
-
 def _longer(task: Task, factor: int) -> Given:
     """Far past the horizon that models are trained on; the collider stays where it ends."""
     import torch
 
-    case, size, frames = _case(task), _middle(task), factor * task.frames
+    case, size, frames = _case(task), task.middle_context, factor * task.frames
     stays = case.collider_path[-1:].expand(frames - task.frames, -1, -1)
     path = torch.cat([case.collider_path, stays])
     return Given(Context(case.body, case.positions[:size], frames - size, path, case.keys), None)
@@ -310,14 +306,14 @@ def _shifted(task: Task) -> Given:
     shift = torch.full((task.dimension,), 20.0)
     if task.height_feature:
         shift[-1] = 0
-    return _given(_case(task), _middle(task), shift=shift)
+    return _given(_case(task), task.middle_context, shift=shift)
 
 
 def _double(task: Task) -> Given:
     """Everything in double precision."""
     import torch
 
-    case, size = _case(task), _middle(task)
+    case, size = _case(task), task.middle_context
     return Given(case.to(torch.float64).context(size), case.future(size))
 
 
@@ -325,10 +321,10 @@ MODEL_CELLS: dict[str, Callable[[Task], Given]] = {
     "context of two frames": lambda task: _given(_case(task), 2),
     "context of all frames but one": lambda task: _given(_case(task), task.frames - 1),
     "four times the horizon": lambda task: _longer(task, 4),
-    "a tenth of the size": lambda task: _given(_case(task), _middle(task), factor=0.1),
-    "ten times the size": lambda task: _given(_case(task), _middle(task), factor=10.0),
+    "a tenth of the size": lambda task: _given(_case(task), task.middle_context, factor=0.1),
+    "ten times the size": lambda task: _given(_case(task), task.middle_context, factor=10.0),
     "shifted by ten scenes": _shifted,
-    "softest material of the scene": lambda task: _given(_case(task, material=0), _middle(task)),
-    "stiffest material of the scene": lambda task: _given(_case(task, material=1), _middle(task)),
+    "softest material of the scene": lambda task: _given(_case(task, material=0), task.middle_context),
+    "stiffest material of the scene": lambda task: _given(_case(task, material=1), task.middle_context),
     "double precision": _double,
 }

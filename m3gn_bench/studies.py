@@ -14,6 +14,7 @@ import numpy as np
 from m3gn_bench.checkpoint import read_description
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
+from m3gn_bench.provenance import commit
 from m3gn_bench.version import __version__
 
 OnProgress = Callable[[int, int], None]
@@ -51,7 +52,7 @@ class Study:
 
     Args:
         folder: where results are kept.
-        settings: what results depend on; those of other settings, or of another version, are dropped.
+        settings: what results depend on; those of other settings, or by other code, are dropped.
 
     Attributes:
         results: those there are of the cells that were asked for, by their names.
@@ -63,7 +64,8 @@ class Study:
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
         self.folder = folder
         self.results: dict[str, Result] = {}
-        head = json.dumps({"settings": settings, "version": __version__}, sort_keys=True).encode()
+        made_by = {"version": __version__, "commit": commit()}
+        head = json.dumps({"settings": settings, **made_by}, sort_keys=True).encode()
         written = folder / "settings.json"
         try:
             if folder.is_dir() and not (written.is_file() and written.read_bytes() == head):

@@ -86,6 +86,7 @@ def tradeoff(
     shipped = _checkpoints(task, folders)
     if output is not None:
         require_drawable(output)
+    _alone(data)
     with report.progress(f"measuring {task.name}") as on_progress:
         result, study = measure(
             task, shipped, data / f"tradeoff-{task.name}.partial", workers=workers, on_progress=on_progress
@@ -165,6 +166,7 @@ def stability(
     else:
         tasks = [get_task(task_name)]
     chosen = [(task, _checkpoints(task, folders)) for task in tasks]
+    _alone(data)
     results, studies = [], []
     for task, shipped in chosen:
         with report.progress(f"judging {task.name}") as on_progress:
@@ -228,6 +230,13 @@ def render_studies(docs: Path, check: bool, as_json: bool) -> None:
         f"{page}: {verdict}, {len(tradeoffs)} trade-offs, {len(stabilities)} grids",
     )
     sys.exit(1 if check and not current else 0)
+
+
+def _alone(data: Path) -> None:
+    """For as long as the command runs, no other study does in that folder: they would disturb each other's times."""
+    from m3gn_bench.datasets.writer import reserved
+
+    click.get_current_context().with_resource(reserved(data / ".studies", "measures", data))
 
 
 def _write(path: Path, text: str) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import ValidationError
 
+from m3gn_bench.datasets.errors import first_problem
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.stability import Stability
 from m3gn_bench.tasks import TASKS
@@ -69,8 +70,8 @@ def read_records(folder: Path) -> tuple[list[TradeOff], list[Stability]]:
                 try:
                     found.append(record.model_validate_json(path.read_bytes()))
                 except ValidationError as error:
-                    first = error.errors()[0]
-                    raise ConfigError(f"{path} is no record of a {kind} study: {first['msg']}") from error
+                    problem = first_problem(error)
+                    raise ConfigError(f"{path} is no record of a {kind} study: {problem}") from error
         return found
 
     return read("tradeoff", TradeOff), read("stability", Stability)

@@ -102,6 +102,11 @@ class Task:
         return self.dimension * self.has_collider
 
     @property
+    def middle_context(self) -> int:
+        """The context size at which models are compared where one is enough."""
+        return self.context_sizes[len(self.context_sizes) // 2]
+
+    @property
     def edge_features(self) -> int:
         """Length of the edge features: type, rest vector and length, current vector and length."""
         return self.edge_types + 2 * (self.dimension + 1)

@@ -27,7 +27,7 @@ from m3gn_bench.checkpoint import (
     save_checkpoint,
 )
 from m3gn_bench.cpu import use_cpu
-from m3gn_bench.data import Case
+from m3gn_bench.data import Case, Materials
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.distributed import ALONE, Group
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
@@ -66,6 +66,7 @@ def train(
     *,
     seed: int,
     dataset_hash: str,
+    materials: Materials | None = None,
     device: str = "cpu",
     threads: int = 1,
     group: Group = ALONE,
@@ -80,6 +81,7 @@ def train(
         out: folder of the run: the state while it lasts, the checkpoint at its end.
         seed: of weights and sampling.
         dataset_hash: content hash of the data, for the record.
+        materials: of which alone the cases are, for the record.
         device: torch device.
         threads: CPU threads of torch.
         group: the processes that train together; all of them call this, and the first one writes.
@@ -90,6 +92,7 @@ def train(
         CheckpointError: the folder holds a different run.
         TrainingError: the loss is no longer finite, or the processes fall apart.
     """
+    commit()  # asked now: the checkout may change while this trains
     use_cpu(threads)
     where = usable_device(device) if group.device is None else group.device
     model = build_model(config, task, seed)
@@ -105,15 +108,18 @@ def train(
         "threads": threads,
         "package_version": __version__,
     }
-    if group.size > 1:  # states of single processes do not say so
+    # What is usual goes without saying.
+    if group.size > 1:
         describe["processes"] = group.size
+    if materials:
+        describe["materials"] = materials
     if group.first((out / DESCRIPTION).is_file()):
         found = read_description(out).model_dump()
-        expected = {"processes": 1, **describe}
-        if any(found[name] != value for name, value in expected.items() if name != "package_version"):
+        expected = {"processes": 1, "materials": {}, **describe}
+        if any(found[name] != value for name, value in expected.items()):
             raise CheckpointError(
-                f"{out} holds another finished run ({found['task']}, seed {found['seed']}, or other data or "
-                "settings); use another folder"
+                f"{out} holds another finished run ({found['task']}, seed {found['seed']}, or other data, settings or "
+                "version); use another folder"
             )
         return read_description(out)
     if not model.is_learned:
@@ -204,7 +210,7 @@ class Run:
         self.identity = identity
         self.progress = Progress()
         self.rng = np.random.default_rng(seed)
-        self.weights = as_one(model.parameters())
+        self.weights = as_one(weight for weight in model.parameters() if weight.requires_grad)
         self.optimizer = torch.optim.AdamW(
             [self.weights],
             lr=self.training.learning_rate,

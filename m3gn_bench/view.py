@@ -152,8 +152,7 @@ def view(
         from m3gn_bench.predictions import predict  # needs torch
 
         task = task_of_data(comparison.task, metadata)
-        middle = task.context_sizes[len(task.context_sizes) // 2]
-        context = middle if comparison.context is None else comparison.context
+        context = task.middle_context if comparison.context is None else comparison.context
         predictions = predict(comparison.checkpoints, task, context, trajectory, key, metadata)
     picture = Picture(
         trajectory,

@@ -61,8 +61,9 @@ def test_a_plan_is_carried_out_once(
 ) -> None:
     plan = write(
         tmp_path,
-        GRID + "seeds = [0, 1]\nshipped_seeds = [1]\nmaterials = { youngs_modulus = [10, 30, 60] }\n",
-        GRID + 'variant = "hasty"\nsettings = { "training.learning_rate" = 0.01 }\n',
+        GRID + "seeds = [0, 1]\nshipped_seeds = [1]\n",
+        GRID + 'variant = "hasty"\nsettings = { "training.learning_rate" = 0.01 }\n'
+        "materials = { youngs_modulus = [10, 30, 60] }\n",
     )
     command = campaign(plan, smoke_file.parent)
     code, before = carry([*command, "--status"], capsys)
@@ -72,8 +73,10 @@ def test_a_plan_is_carried_out_once(
     home = tmp_path / "home"
     records = {record.name: record for record in read_records(home)}
     assert set(records) == {"m3gn-smoke-s0", "m3gn-smoke-s1", "m3gn-smoke-hasty-s0"}
-    assert len(records["m3gn-smoke-s0"].keys) == 3  # of four test trajectories one is of 100 MPa
-    assert records["m3gn-smoke-hasty-s0"].checkpoint.config.training["learning_rate"] == 0.01
+    hasty = records["m3gn-smoke-hasty-s0"]
+    assert len(hasty.keys) == 3  # of four test trajectories one is of 100 MPa
+    assert hasty.checkpoint.config.training["learning_rate"] == 0.01
+    assert hasty.checkpoint.materials == hasty.materials
     assert [name for name, record in records.items() if record.ships] == ["m3gn-smoke-s1"]
     _, shipped = load_checkpoint(checkpoint_folder("sheet_deformation", "m3gn", "smoke", 1, home))
     assert shipped == records["m3gn-smoke-s1"].checkpoint
@@ -205,6 +208,10 @@ def _alive(session: int) -> bool:
         (HEAD.replace("smoke", "small") + GRID, "unknown 'small'"),
         (HEAD + GRID + 'variant = "a/b"\n', r"runs.0.variant"),
         (HEAD + GRID + 'variant = "a"\nshipped_seeds = [0]\n', "table 1: checkpoints of a variant"),
+        (HEAD + GRID + "seeds = [-1]\n", r"runs.0.seeds.0: .*greater than or equal to 0"),
+        (HEAD + GRID + "shipped_seeds = [7]\n", r"runs.0: .*shipped_seeds: 7 is none of seeds"),
+        (HEAD + GRID + 'settings = { "training.learning_rate" = 1 }\n', "name what differs by a variant"),
+        (HEAD + GRID + "materials = { youngs_modulus = [10] }\n", "name what differs by a variant"),
     ],
 )
 def test_a_wrong_plan_is_refused(tmp_path: Path, text: str, reason: str) -> None:
@@ -215,7 +222,7 @@ def test_a_wrong_plan_is_refused(tmp_path: Path, text: str, reason: str) -> None
 
 
 def test_an_unknown_material_is_a_problem_of_its_run(smoke_file: Path, tmp_path: Path) -> None:
-    (planned,) = read_plan(write(tmp_path, GRID + "materials = { density = [1] }\n"))
+    (planned,) = read_plan(write(tmp_path, GRID + 'variant = "a"\nmaterials = { density = [1] }\n'))
     outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
     assert outcome.record is None
     assert "unknown material parameter 'density'; known: youngs_modulus" in str(outcome.error)
@@ -294,7 +301,7 @@ def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
 def test_runs_on_other_materials_have_folders_of_their_own(smoke_file: Path, tmp_path: Path) -> None:
     everything = "10, 60, 180, 500, 1000"
     for moduli in (everything, f"{everything}, 2000"):
-        grid = GRID + f"materials = {{ youngs_modulus = [{moduli}] }}\n"
+        grid = GRID + f'variant = "some"\nmaterials = {{ youngs_modulus = [{moduli}] }}\n'
         (planned,) = read_plan(write(tmp_path, grid))
         outcome = carry_out(Job(planned, smoke_file, tmp_path / "runs"))
         assert outcome.error is None, outcome.error

@@ -147,6 +147,18 @@ def test_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdict_of(monkeypatch, records, faster) == "undecided"
     elsewhere = [r.model_copy(update={"machine": "another"}) if r.model == "b" else r for r in slow]
     assert verdict_of(monkeypatch, elsewhere, faster) == "not measured yet"
+    # Of two machines, only one has a time of each.
+    both = [
+        r.model_copy(update={"machine": machine, "evaluation_device": device, "evaluation_seconds": seconds})
+        for r, machine, device, seconds in zip(
+            [records[0], records[1], records[3], records[4]],
+            ["one", "two", "one", "two"],
+            ["cpu", "cuda", "cuda", "cpu"],
+            [3.0, 1.0, 1.0, 1.0],
+            strict=True,
+        )
+    ]
+    assert verdict_of(monkeypatch, both, faster) == "not measured yet"
     threads = [r.model_copy(update={"evaluation_threads": 2}) for r in slow]
     assert verdict_of(monkeypatch, threads, faster) == "not measured yet"
 

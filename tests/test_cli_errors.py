@@ -299,6 +299,9 @@ def test_damaged_checkpoints(
     [
         (["--model", "mgn"], ["holds a m3gn, not a mgn"]),
         (["--task", "sheet_deformation_ood"], ["trained on sheet_deformation, not on sheet_deformation_ood"]),
+        (["--seed", "3"], ["is of seed 0, not of 3"]),
+        (["--preset", "paper"], ["is of preset smoke, not of paper"]),
+        (["--track", "my track"], ["--track 'my track': letters, digits and any of . - _ make file names"]),
         (["--contexts", "1"], ["context size 1 is out of range", "51 frames", "2 to 50"]),
         (["--contexts", "51"], ["context size 51 is out of range", "2 to 50"]),
         (["--contexts", "2,-3"], ["context size -3 is out of range"]),

@@ -127,6 +127,27 @@ def test_planted_error_in_weights_is_found(
     assert all("SHA-256" in problem for problem in report.problems)
 
 
+def test_a_model_that_is_not_there_is_named(
+    use_board: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside what else was found."""
+    honest = next(r for r in read_records(use_board) if r.model == "stand_still")
+    original = checkpoint_folder("sheet_deformation", "stand_still", "smoke", home=use_board)
+    shutil.copytree(original, tmp_path / "gone")
+    description = tmp_path / "gone" / "checkpoint.json"
+    description.write_text(description.read_text().replace('"stand_still"', '"gone"'))
+    gone = honest.model_copy(update={"model": "gone"})
+    monkeypatch.setattr(
+        check,
+        "checkpoint_folder",
+        lambda task, model, *_: original if model == "stand_still" else tmp_path / "gone",
+    )
+    report = run_check([gone, honest])
+    assert len(report.compared) == 3
+    (problem,) = report.problems
+    assert "unknown model 'gone'" in problem
+
+
 def test_planted_error_in_a_model_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from m3gn_bench.baselines.mgn import StepSimulator
 
@@ -408,6 +429,13 @@ def other_settings(record: ResultRecord) -> dict[str, Any]:
     return {"checkpoint": changed.model_copy(update={"config_hash": config.hash()})}
 
 
+def unknown_preset(record: ResultRecord) -> dict[str, Any]:
+    """On a board of its own."""
+    config = record.checkpoint.config.model_copy(update={"preset": "huge"})
+    described = {"config": config, "config_hash": RunConfig.from_json(config.model_dump()).hash()}
+    return {"preset": "huge", "checkpoint": record.checkpoint.model_copy(update=described)}
+
+
 def longer(record: ResultRecord) -> dict[str, Any]:
     """Trained for more steps than the others of its row, and says so; another seed."""
     changed = training(steps=600)(record)["checkpoint"].model_copy(update={"steps": 600, "seed": 1})
@@ -429,7 +457,10 @@ def per_timestep(longer: int) -> Changes:
 
 @pytest.fixture
 def submitted(board: Path) -> ResultRecord:
-    return next(r for r in read_records(board) if r.model == "mgn").model_copy(update={"track": "theirs"})
+    """Whatever state the checkout of these tests is in, it comes from a commit."""
+    made = next(r for r in read_records(board) if r.model == "mgn")
+    trained = made.checkpoint.model_copy(update={"commit": "c0ffee"})
+    return made.model_copy(update={"track": "theirs", "commit": "c0ffee", "checkpoint": trained})
 
 
 def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: Path) -> None:
@@ -463,6 +494,8 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         (training(steps=None, minutes=1e-9), "minutes: "),
         (longer, "its budget is {'minutes': None, 'steps': 600}, but"),
         ({"materials": {"youngs_modulus": (10.0,)}}, "name them by a variant"),
+        (checkpoint(materials={"youngs_modulus": (10.0,)}), "materials: {}, not {'youngs_modulus': (10.0,)}"),
+        (unknown_preset, "its settings are not those of preset 'huge'"),
         (checkpoint(config_hash="0"), "config_hash: 0, not"),
         (training(optimizer="sgd"), "configuration: none of mgn"),
         (per_timestep(-1), "frames that errors are of"),
@@ -532,6 +565,15 @@ def test_a_board_compares_like_with_like(board: Path) -> None:
             summary.entries([one, seed], one.track, one.task)
 
 
+def test_what_is_replaced_does_not_count(board: Path, submitted: ResultRecord) -> None:
+    """Where it is the only record of its row, a new one may have another budget."""
+    new = submitted.model_copy(update=training(steps=600)(submitted))
+    new = new.model_copy(update={"checkpoint": new.checkpoint.model_copy(update={"steps": 600})})
+    problems = submission.review(new, read_records(board)).problems
+    assert any("its budget is" in problem for problem in problems)
+    assert submission.review(new, read_records(board), replace=True).problems == ()
+
+
 def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecord) -> None:
     keys = tuple(key.replace("test", "validation") for key in submitted.keys)
     trial = submitted.model_copy(update={"track": "trials", "split": "validation", "keys": keys})
@@ -555,6 +597,10 @@ def test_a_submission_on_other_bits_is_remarked(board: Path, submitted: ResultRe
         ({"package_version": "99"}, "made with version 99"),
         (checkpoint(dataset_hash="0"), "nothing on the board was trained on the same bits"),
         (checkpoint(minutes=1e3), "is its machine so much slower?"),
+        (checkpoint(steps=10**6), "are its steps so much cheaper?"),
+        (checkpoint(device="cuda"), "are 3 steps a fair budget?"),
+        (checkpoint(commit="c0ffee+changes"), "trained by code with changes that no commit holds"),
+        ({"commit": "c0ffee+changes"}, "scored by code with changes that no commit holds"),
         ({"model": "theirs"}, "theirs is not installed here"),
     ],
 )

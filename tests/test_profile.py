@@ -164,6 +164,7 @@ def test_command(smoke_file: Path) -> None:
     text = run_cli(*arguments)
     assert text.exit_code == 0
     assert "context encoding" in text.stdout
+    assert "total [s]" in text.stdout
 
 
 def test_list_shows_the_papers_sizes() -> None:

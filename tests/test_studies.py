@@ -17,6 +17,7 @@ from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.cli import cli
 from m3gn_bench.data import case_from
 from m3gn_bench.datasets.schema import DATASET_SEED
+from m3gn_bench.datasets.writer import reserved
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.figures import save
 from m3gn_bench.generators.deformable_block import DeformableBlock
@@ -211,7 +212,7 @@ def test_models_do_not_mind_where_the_scene_is(name: str, monkeypatch: pytest.Mo
     monkeypatch.setitem(
         MODEL_CELLS,
         "nothing extreme",
-        lambda task: stability._given(stability._case(task), stability._middle(task)),
+        lambda task: stability._given(stability._case(task), task.middle_context),
     )
     m3gn = Shipped("m3gn", "compact", checkpoint_folder(name, "m3gn", "compact"))
     usual, shifted, double = (
@@ -414,6 +415,13 @@ def assert_sound(result: tradeoff.TradeOff) -> None:
         assert model.pays_off_after < model.pays_off_with_data
         rival = next(s for s in result.simulators if f"{s.knob}: {s.label}" == model.rival)
         assert model.pays_off_after == math.ceil(model.training_seconds / (rival.seconds - model.seconds))
+
+
+def test_one_study_at_a_time(tmp_path: Path) -> None:
+    """Two would disturb each other's times, and one would delete what the other has."""
+    with reserved(tmp_path / ".studies", "measures", tmp_path):
+        done = CliRunner().invoke(cli, ["stability", TASK.name, "--data", str(tmp_path)])
+    assert "another process measures in" in str(done.exception)
 
 
 @pytest.mark.usefixtures("small")

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ import m3gn_bench.training
 from m3gn_bench.checkpoint import Checkpoint, load_checkpoint
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
-from m3gn_bench.model import load_preset
+from m3gn_bench.model import Model, build_model, load_preset
 from m3gn_bench.tasks import get_task
 from m3gn_bench.training import STATE, Progress, train
 
@@ -92,6 +93,21 @@ def test_best_weights_are_kept(tmp_path: Path) -> None:
 def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
     hashes = [run("mgn", tmp_path / str(i), 3, seed=seed).weights_sha256 for i, seed in enumerate((0, 0, 1))]
     assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_frozen_weights_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decay would move them, too."""
+    frozen = "simulator.network.readout.bias"
+    made = []
+
+    def build(*arguments: Any) -> Model:
+        made.append(build_model(*arguments))
+        made[0].get_parameter(frozen).requires_grad_(False).fill_(0.25)
+        return made[0]
+
+    monkeypatch.setattr(m3gn_bench.training, "build_model", build)
+    run("mgn", tmp_path, 3, **{"training.weight_decay": 0.5})
+    assert (made[0].get_parameter(frozen) == 0.25).all()
 
 
 def test_time_budget_ends(tmp_path: Path) -> None:
