@@ -51,7 +51,7 @@ class RecordedDataset(Record):
 
 
 class Reproduction(Record):
-    """How a dataset file compares with the record: bit by bit, or at least by its probes."""
+    """How a dataset file compares with the record: bit by bit, or else by probes of the quick tier's trajectories."""
 
     scene: str
     tier: str
@@ -80,11 +80,21 @@ def record(path: Path, folder: Path | None = None) -> Path:
     """Record a dataset file; returns the record's path.
 
     Raises:
-        DatasetError: the file is not the benchmark's own (see `require_own`).
+        DatasetError: the file is not the benchmark's own (see `require_own`), or holds less than what is recorded of
+            its version; it cannot be read, or the record not written.
     """
     require_own(path)
     with open_file(path) as file:
         metadata = read_metadata(file)
+        destination = (folder or FOLDER) / f"{metadata.scene}.json"
+        if destination.is_file():
+            before = read_record(metadata.scene, folder)
+            lost = before.hashes.keys() - tier_hashes(file).keys()
+            if lost and before.dataset_version == metadata.dataset_version:
+                raise DatasetError(
+                    f"{path} has no tier {', '.join(sorted(lost))}, which is recorded of {metadata.scene}; "
+                    "record a file that has"
+                )
         quick = sorted(key for key in stored_hashes(file) if in_tier(key, SMALL_TIERS["quick"]))
         recorded = RecordedDataset(
             scene=metadata.scene,
@@ -95,7 +105,6 @@ def record(path: Path, folder: Path | None = None) -> Path:
             hashes=tier_hashes(file),
             probes={key: probe(read_trajectory(file, key)) for key in quick},
         )
-    destination = (folder or FOLDER) / f"{metadata.scene}.json"
     write_bytes_atomically(destination, (recorded.model_dump_json(indent=1) + "\n").encode())
     return destination
 

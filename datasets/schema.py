@@ -19,7 +19,7 @@ attributes and splits. All strings are of fixed length: HDF5 guards those with c
 """
 
 import json
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -121,7 +121,8 @@ class Metadata(Record):
             if name == "format":
                 continue
             value = as_text(value)
-            if isinstance(value, str) and value.startswith(("{", "[")):
+            field = cls.model_fields.get(name)
+            if isinstance(value, str) and field and get_origin(field.annotation) in (dict, tuple):
                 value = json.loads(value)
             values[name] = value.item() if hasattr(value, "item") else value
         return cls.model_validate(values)

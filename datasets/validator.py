@@ -16,6 +16,7 @@ from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, tier_sizes, tra
 from m3gn_bench.datasets.trajectory import (
     CELL_CORNERS,
     FIXED,
+    FREE,
     VTK_TETRA,
     Trajectory,
     combine_hashes,
@@ -127,15 +128,20 @@ def content_problems(trajectory: Trajectory, metadata: Metadata, where: str) -> 
         return Problem(code=code, where=where, message=message)
 
     mesh = trajectory.mesh
-    nodes = len(mesh.rest_positions)
     misfits = list(_misfits(trajectory, metadata))
     yield from (problem("E004", misfit) for misfit in misfits)
     if misfits:
         return
-    if set(trajectory.material) != set(metadata.material_units):
-        yield problem(
-            "E004", f"material {sorted(trajectory.material)} is not {sorted(metadata.material_units)}"
-        )
+    nodes = len(mesh.rest_positions)
+    for kind, found, units in (
+        ("material", trajectory.material, metadata.material_units),
+        ("loads", trajectory.loads, metadata.load_units),
+    ):
+        if set(found) != set(units):
+            yield problem("E004", f"{kind} {sorted(found)} are not {sorted(units)}")
+    kinds = set(np.unique(mesh.node_type).tolist()) - {FREE, FIXED}
+    if kinds:
+        yield problem("E004", f"node_type {min(kinds)} is neither {FREE} (free) nor {FIXED} (fixed)")
     for name, array in trajectory.arrays().items():
         if not np.isfinite(array).all():
             yield problem(

@@ -257,7 +257,9 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
     def check(self, trajectory: Trajectory) -> list[str]:
         """Finite, clamped, no triangle turned over, no punch-through, little penetration, no jump."""
         positions = trajectory.positions.astype(np.float64)
-        finite = np.isfinite(positions).all((1, 2))
+        assert trajectory.collider_positions is not None
+        collider = trajectory.collider_positions.astype(np.float64)
+        finite = np.isfinite(positions).all((1, 2)) & np.isfinite(collider).all((1, 2))
         if not finite.all():
             return [problem(int(finite.argmin()), "positions are not finite", REMEDY)]
         problems = []
@@ -304,8 +306,10 @@ class DeformableBlock(Leveled, SingleTask, SimulatedWithScikitFem):
                     REMEDY,
                 )
             )
-        assert trajectory.collider_positions is not None
-        collider = trajectory.collider_positions.astype(np.float64)
+        inside = radius - np.linalg.norm(positions - collider.mean(1, keepdims=True), axis=-1).min(1)
+        if inside.max() > MAX_PENETRATION * radius:
+            what = f"a recorded node is {inside.max():.2f} mm inside the circle of radius {radius:.1f} mm"
+            problems.append(problem(int(inside.argmax()), what, REMEDY))
         travel = np.linalg.norm(np.diff(collider, axis=0), axis=-1).max(-1)
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(-1)
         allowed = np.where(np.arange(len(steps)) < TRANSIENT, MAX_TRANSIENT_STEP, MAX_STEP * travel)

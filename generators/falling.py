@@ -52,6 +52,9 @@ FLAT = 1e-12  # volume of a cell over the cube of its size
 MAX_HALVINGS = 3  # of the step, where a motion diverges
 MAX_FLIGHT_ERROR = 1e-6  # [m]
 MAX_PENETRATION = 5e-4  # [m]; the explicit solver has none, vertex block descent has springs
+MAX_STEP_RATIO = (
+    1.5  # of the way between frames at the largest speed, which is taken in frames only (stored: 1.2)
+)
 MAX_SPEED_RATIO = 10.0  # of a fall from the highest node; ears and tips whip at up to 4
 
 TOGETHER = 64  # trajectories at once on a GPU, which a single body does not keep busy
@@ -189,6 +192,8 @@ class _FallingObjects(Leveled, SingleTask):
         height, *others = {parameters.height for parameters in draws}
         if others:
             raise ParameterError("bodies that are simulated together must fall from one height")
+        if not height >= 0:
+            raise ParameterError(f"height must not be negative, as {height} m is")
         # Until it touches the floor the body is free of stress, and its motion known.
         flight = flight_frames(height)
         if frames <= flight:
@@ -256,7 +261,10 @@ class _FallingObjects(Leveled, SingleTask):
         )
 
     def check(self, trajectory: Trajectory) -> list[str]:
-        """Finite, falling freely at first, above the floor, no energy from nowhere, nothing left inverted."""
+        """Finite, falling freely at first, above the floor, no energy from nowhere, nothing left inverted.
+
+        And that what is recorded moves as fast as what was simulated.
+        """
         positions = trajectory.positions.astype(np.float64)
         finite = np.isfinite(positions).all((1, 2))
         if not finite.all():
@@ -272,7 +280,10 @@ class _FallingObjects(Leveled, SingleTask):
                 problem(int(astray.argmax()), what, "start it at rest, its lowest point at the height")
             )
         lowest = positions[:, :, 2].min(1)
-        if lowest.min() < -MAX_PENETRATION:
+        if not abs(lowest[0] - height) < MAX_FLIGHT_ERROR:
+            what = f"its lowest point is {lowest[0]:.3g} m above the floor, not {height:g} m"
+            problems.append(problem(0, what, "start it at the height"))
+        if lowest.min() < (0.0 if self.solver == "explicit" else -MAX_PENETRATION):
             what = f"a node is {-lowest.min():.2g} m below the floor"
             problems.append(problem(int(lowest.argmin()), what, "use more substeps"))
         found = trajectory.diagnostics
@@ -282,6 +293,11 @@ class _FallingObjects(Leveled, SingleTask):
         if found["inverted_tetrahedra_at_end"]:
             what = f"{found['inverted_tetrahedra_at_end']:.0f} tetrahedra are inverted at the end"
             problems.append(problem(len(positions) - 1, what, REMEDY))
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(-1)
+        fastest = MAX_STEP_RATIO * found["max_speed"] * FRAME_TIME
+        if not steps.max() <= fastest:
+            what = f"a node jumps by {steps.max():.2g} m, farther than the fastest one can move ({fastest:.2g} m)"
+            problems.append(problem(int(steps.argmax()) + 1, what, REMEDY))
         limit = MAX_SPEED_RATIO * np.sqrt(2 * GRAVITY * positions[0, :, 2].max())
         if not found["max_speed"] <= limit:
             what = f"a node moves at {found['max_speed']:.1f} m/s, faster than any fall explains ({limit:.1f} m/s)"

@@ -21,10 +21,12 @@ from m3gn_bench.datasets.schema import (
     Metadata,
     Rejection,
     Split,
+    as_split,
     tier_sizes,
     trajectory_key,
 )
 from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.datasets.validator import content_problems
 from m3gn_bench.datasets.writer import merge_shards, reserved, write_shard
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.executors import parse_executor
@@ -158,8 +160,9 @@ def generate(
         on_progress: called with (done, total) after every trajectory.
 
     Raises:
-        GeneratorError: unknown names, a trajectory that cannot be made, or a cluster that cannot be used.
-        DatasetError: the folder cannot be written.
+        GeneratorError: unknown names, a trajectory that cannot be made, or one that the validator would find fault
+            with, or a cluster that cannot be used.
+        DatasetError: no such split or tier; the folder cannot be written.
     """
     if fidelity not in scene.fidelities:
         raise GeneratorError(unknown_name("fidelity", fidelity, list(scene.fidelities)))
@@ -168,6 +171,9 @@ def generate(
     if seed < 0:
         raise GeneratorError(f"the seed must not be negative, as {seed} is")
     parse_executor(executor)
+    if not splits:
+        raise GeneratorError("there is no split to make")
+    splits = [as_split(split) for split in splits]
     sizes = tier_sizes(tier, scene.paper_sizes)
     metadata = _metadata(scene, tier, fidelity, seed)
     path = out / dataset_name(scene, tier, splits, fidelity, seed)
@@ -281,6 +287,10 @@ def _make_shards(job: _Job) -> int:
         )
     made = _simulate(job.scene, job.split, missing, metadata.seed, metadata.fidelity)
     for index, (trajectory, rejected) in zip(missing, made, strict=True):
+        for problem in content_problems(trajectory, metadata, keys[index]):
+            raise GeneratorError(
+                f"scene {job.scene.name} is not what it says: {problem.where}: {problem.message}"
+            )
         own = metadata.model_copy(update={"rejections": tuple(rejected)})
         write_shard(_shard(job.folder, keys[index]), keys[index], trajectory, own)
     return len(keys)

@@ -248,13 +248,12 @@ def _is_npz(path: Path) -> bool:
 
 def _read_npz(path: Path) -> SoftBody:
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return SoftBody(
-                path.stem,
-                stored["vertices"].astype(np.float64),
-                stored["tetrahedra"].astype(np.int32),
-                int(stored["surface_nodes"]),
-            )
+        with np.load(path, allow_pickle=False) as stored, np.errstate(invalid="ignore"):
+            tetrahedra = stored["tetrahedra"].astype(np.int32)
+            if tetrahedra.shape[1:] != (4,) or (tetrahedra != stored["tetrahedra"]).any():
+                raise ValueError(f"tetrahedra of shape {tetrahedra.shape} are not four numbers of nodes each")
+            vertices = stored["vertices"].astype(np.float64)
+            return SoftBody(path.stem, vertices, tetrahedra, int(stored["surface_nodes"]))
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise GeneratorError(f"{path} is damaged, or no mesh that write_object wrote: {error}") from error
 

@@ -186,6 +186,16 @@ def test_checks_see_bad_positions(trajectory: Trajectory) -> None:
         assert spoiled(trajectory, positions=positions)[0].startswith(expected)
 
 
+def test_checks_see_what_is_recorded(trajectory: Trajectory) -> None:
+    """Not only what the solver says of itself: a ring that has gone, or a block that it does not move."""
+    assert trajectory.collider_positions is not None
+    ring = trajectory.collider_positions.copy()
+    ring[5, 3] = np.nan
+    assert spoiled(trajectory, collider_positions=ring)[0].startswith("frame 5: positions are not finite; ")
+    still = np.repeat(trajectory.positions[:1], len(trajectory.positions), axis=0)
+    assert "inside the circle of radius" in spoiled(trajectory, positions=still)[0]
+
+
 @pytest.mark.parametrize(
     ("diagnostic", "value", "message"),
     [

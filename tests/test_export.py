@@ -526,6 +526,7 @@ def test_files_stand_beside_the_dataset(
         (["--format", "huggingface", "--index", "0"], "leave out --split and --index"),
         (["--format", "npz", "-o", "{file}/x.npz"], "x.npz"),
         (["--format", "pyg", "-o", "/proc/x.pt"], "cannot write /proc/x.pt"),
+        (["--format", "pyg", "-o", "/etc/passwd/x.pt"], "cannot write /etc/passwd/x.pt: "),
     ],
 )
 def test_refusals(

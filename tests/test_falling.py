@@ -154,11 +154,23 @@ def test_a_gpu_simulates_the_same_falls(tmp_path: Path) -> None:
     assert np.abs(found.positions[:30] - expected.positions[:30]).max() < 1e-6
 
 
+def sink(trajectory: Trajectory, depth: float) -> None:
+    """The lowest node of a frame, so far below the floor."""
+    positions = trajectory.positions[90]
+    positions[positions[:, 2].argmin(), 2] = -depth
+
+
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
         (lambda t: t.positions.__setitem__((80, 3, 1), np.nan), "frame 80: positions are not finite"),
-        (lambda t: t.positions.__setitem__((90, 7, 2), -0.01), "frame 90: a node is 0.01 m below the floor"),
+        (lambda t: sink(t, 0.01), "frame 90: a node is 0.01 m below the floor"),
+        (
+            lambda t: t.positions.__iadd__(np.float32([0, 0, 0.3])),
+            r"frame 0: its lowest point is 0.32 m above",
+        ),
+        (lambda t: t.positions[60:].__iadd__(np.float32([1, 0, 0])), "frame 60: a node jumps by 1"),
+        (lambda t: sink(t, 1e-5), "frame 90: a node is 1e-05 m below the floor"),
         (lambda t: t.diagnostics.update(energy_growth=0.02), "energy grows by 2.00%"),
         (lambda t: t.diagnostics.update(inverted_tetrahedra_at_end=3), "3 tetrahedra are inverted"),
         (lambda t: t.diagnostics.update(max_speed=100.0), "100.0 m/s"),

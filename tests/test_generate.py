@@ -162,6 +162,38 @@ def test_all_draws_differ(fake: FakeScene) -> None:
     assert len(set(draws)) == len(draws)
 
 
+def test_what_the_validator_would_find_is_not_written(
+    fake: FakeScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where a scene's own check is blind."""
+    good = FakeScene.simulate
+
+    def spoilt(self: FakeScene, parameter: float, fidelity: str) -> Trajectory:
+        made = good(self, parameter, fidelity)
+        made.positions[1, 2, 0] = np.nan
+        return made
+
+    monkeypatch.setattr(FakeScene, "simulate", spoilt)
+    with pytest.raises(
+        GeneratorError, match=r"scene fake .* train_\d+: positions holds 1 numbers that are not finite"
+    ):
+        generate(fake, "smoke", tmp_path)
+    assert list(tmp_path.glob("*.h5")) == []
+
+
+def test_unknown_splits_are_refused(fake: FakeScene, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="unknown split 'tets'; known: test, train, validation"):
+        generate(fake, "smoke", tmp_path, splits=["tets"])  # type: ignore[list-item]
+    with pytest.raises(GeneratorError, match="no split"):
+        generate(fake, "smoke", tmp_path, splits=[])
+
+
+def test_units_in_brackets_are_text(fake: FakeScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeScene, "time_unit", "[s]")
+    with open_file(generate(fake, "smoke", tmp_path).file) as file:
+        assert read_metadata(file).time_unit == "[s]"
+
+
 # --- rejected draws ---------------------------------------------------------------------------------------
 
 

@@ -228,6 +228,18 @@ def test_an_unusable_tetrahedral_mesh_is_refused(
         read_object(path)
 
 
+@pytest.mark.parametrize(
+    "cells",
+    [np.array([[0, 1, 2]]), np.arange(4), np.array([[0.5, 1.7, 2.2, 3.9]]), np.array([[2**32, 1, 2, 3]])],
+    ids=["three corners", "one row", "fractions", "beyond 32 bits"],
+)
+def test_cells_that_are_no_four_nodes_are_refused(tmp_path: Path, cells: np.ndarray) -> None:
+    path = tmp_path / "mine.npz"
+    np.savez(path, vertices=CORNER_TETRAHEDRON, tetrahedra=cells, surface_nodes=0)
+    with pytest.raises(GeneratorError, match=r"mine.npz is damaged, .* are not four numbers of nodes each"):
+        read_object(path)
+
+
 def test_a_mesh_with_a_sliver_is_refused(tmp_path: Path) -> None:
     """One node close to the opposite facet: the solver's step goes with the root of its distance."""
     mesh = box(2)

@@ -86,6 +86,18 @@ def test_less_than_the_quick_tier_is_not_recorded(smoke_file: Path, tmp_path: Pa
         record(smoke_file, tmp_path)
 
 
+def test_less_than_what_is_recorded_does_not_replace_it(quick_file: Path, tmp_path: Path) -> None:
+    path = record(quick_file, tmp_path)
+    larger = json.loads(path.read_text())
+    larger["hashes"]["paper"] = "0" * 64
+    path.write_text(json.dumps(larger))
+    with pytest.raises(DatasetError, match="has no tier paper, which is recorded of sheet_deformation"):
+        record(quick_file, tmp_path)
+    assert json.loads(path.read_text()) == larger
+    path.write_text(json.dumps(larger | {"dataset_version": "0.9"}))
+    record(quick_file, tmp_path)  # of a newer version less is something
+
+
 def test_probe_covers_the_last_frame(smoke_file: Path) -> None:
     with open_file(smoke_file) as file:
         trajectory = read_trajectory(file, "test_00000")

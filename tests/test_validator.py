@@ -207,6 +207,12 @@ CONTENT_DEFECTS: dict[str, tuple[str, Change]] = {
         "E005",
         Mutation(lambda t: replace(t, material={**t.material, "density": np.inf})),
     ),
+    "other loads than named": ("E004", Mutation(lambda t: replace(t, loads={"pull": t.loads["push"]}))),
+    "one number for a mesh": (
+        "E004",
+        Mutation(lambda t: replace(t, mesh=replace(t.mesh, rest_positions=np.array(1, np.float32)))),
+    ),
+    "node neither free nor fixed": ("E004", with_value("mesh/node_type", (2,), 7)),
     "node too large": ("E006", with_value("mesh/cells", (1, 3), 5)),
     "node negative": ("E006", with_value("mesh/cells", (0, 0), -1)),
     "collider's node too large": ("E006", with_value("collider_edges", (0, 1), 2)),

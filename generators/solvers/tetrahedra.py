@@ -190,10 +190,6 @@ class TetrahedralSolid:
         start = np.random.default_rng(0).normal(size=size)
         return float(eigsh(operator, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
 
-    def volume_ratios(self, positions: Array) -> Array:
-        """Smallest J in every tetrahedron, shape [cells]; negative where one is inverted."""
-        return np.asarray(np.linalg.det(self._deformation_gradients(positions)).min(1))
-
     def elastic_energy(self, positions: Array) -> float:
         """Stored energy [J]."""
         gradients = self._deformation_gradients(positions)
