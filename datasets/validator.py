@@ -26,7 +26,7 @@ CODES = {
     "E001": "the file cannot be opened as a dataset of this schema version",
     "E002": "root attributes are missing, unknown or out of range",
     "E003": "a group or array is missing or cannot be read",
-    "E004": "an array has the wrong shape, type or number of dimensions",
+    "E004": "an array has the wrong shape or type; material, loads or kinds of nodes are not those that are named",
     "E005": "a number is not finite",
     "E006": "a cell refers to a node that does not exist, or its type is unknown",
     "E007": "a cell has no or negative volume",
