@@ -32,9 +32,9 @@ TRACKS = {
     "many minutes of one core they took, mean over the seeds that a CPU trained; where there are none, minutes of the "
     "device that is named (the steps are the same anywhere). *By the clock*: the budget was minutes of that machine.",
     "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
-    "paper": "Networks of the paper's size, each for the steps that it makes in half an hour of one core, validated ten "
-    "times on 18 trajectories ([plan](plans/paper.toml)). This is not the paper's training, which took days on a GPU; its "
-    "learning rates are kept, though they are too low for so short a time.",
+    "paper": "Networks of the paper's size, each for the steps that it makes in half an hour of one core, validated "
+    "ten times on 18 trajectories ([plan](plans/paper.toml)). This is not the paper's training, which took days on a "
+    "GPU; its learning rates are kept, though they are too low for so short a time.",
     "tuning": "Trials of learning rates for the compact presets, on the *validation* split "
     "([plan](plans/tuning.toml)).",
     "noise": "Trials of the compact MeshGraphNets' input noise, on the *validation* split ([plan](plans/noise.toml)).",

@@ -403,7 +403,7 @@ def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: st
         )
 
 
-def _require_part_of_a_file_name(option: str, value: str, kind: object, allowed: str) -> None:
+def _require_part_of_a_file_name(option: str, value: str, kind: Any, allowed: str) -> None:
     """Raises ConfigError if a track or a variant has characters that such names do not have."""
     from pydantic import TypeAdapter, ValidationError
 
