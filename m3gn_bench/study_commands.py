@@ -77,19 +77,26 @@ def tradeoff(
     Takes some minutes; an interrupted run goes on where it stopped.
     """
     from m3gn_bench.figures import require_drawable, save
+    from m3gn_bench.generators.knobs import knobs_of
     from m3gn_bench.study_page import advice, draw
     from m3gn_bench.tasks import get_task
     from m3gn_bench.tradeoff import measure
 
     report = Report(as_json)
     task = get_task(task_name)
+    knobs = knobs_of(task.name)
     shipped = _checkpoints(task, folders)
     if output is not None:
         require_drawable(output)
     _alone(data)
     with report.progress(f"measuring {task.name}") as on_progress:
         result, study = measure(
-            task, shipped, data / f"tradeoff-{task.name}.partial", workers=workers, on_progress=on_progress
+            task,
+            shipped,
+            data / f"tradeoff-{task.name}.partial",
+            knobs=knobs,
+            workers=workers,
+            on_progress=on_progress,
         )
     if record_home is not None:
         _write(record_home / f"tradeoff-{task.name}.json", result.model_dump_json(indent=1))
@@ -156,7 +163,7 @@ def stability(
     Without TASK, every task whose scene says what its extremes are. Takes some minutes each; an interrupted run goes on
     where it stopped.
     """
-    from m3gn_bench.generators.extremes import has_extremes
+    from m3gn_bench.generators.extremes import extremes_of, has_extremes
     from m3gn_bench.stability import measure
     from m3gn_bench.tasks import TASKS, get_task
 
@@ -165,15 +172,16 @@ def stability(
         tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
     else:
         tasks = [get_task(task_name)]
-    chosen = [(task, _checkpoints(task, folders)) for task in tasks]
+    chosen = [(task, extremes_of(task.scene), _checkpoints(task, folders)) for task in tasks]
     _alone(data)
     results, studies = [], []
-    for task, shipped in chosen:
+    for task, grid, shipped in chosen:
         with report.progress(f"judging {task.name}") as on_progress:
             result, study = measure(
                 task,
                 shipped,
                 data / f"stability-{task.name}.partial",
+                extremes=grid,
                 workers=workers,
                 on_progress=on_progress,
             )
