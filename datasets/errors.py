@@ -17,10 +17,10 @@ class DatasetError(BenchError):
     """A dataset file cannot be written, opened or trusted."""
 
 
-def first_problem(error: "ValidationError") -> str:
-    """What pydantic found first, in a line: where, and what."""
+def first_problem(error: "ValidationError", *within: str) -> str:
+    """What pydantic found first, in a line: where (and within what that is), and what."""
     first = error.errors()[0]
-    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
+    return ": ".join(filter(None, (".".join(map(str, (*within, *first["loc"]))), first["msg"])))
 
 
 def unknown_name(kind: str, name: str, known: list[str]) -> str:

@@ -85,11 +85,11 @@ def record(path: Path, folder: Path | None = None) -> Path:
     """
     require_own(path)
     with open_file(path) as file:
-        metadata = read_metadata(file)
+        metadata, hashes = read_metadata(file), tier_hashes(file)
         destination = (folder or FOLDER) / f"{metadata.scene}.json"
         if destination.is_file():
             before = read_record(metadata.scene, folder)
-            lost = before.hashes.keys() - tier_hashes(file).keys()
+            lost = before.hashes.keys() - hashes.keys()
             if lost and before.dataset_version == metadata.dataset_version:
                 raise DatasetError(
                     f"{path} has no tier {', '.join(sorted(lost))}, which is recorded of {metadata.scene}; "
@@ -102,7 +102,7 @@ def record(path: Path, folder: Path | None = None) -> Path:
             generator_version=metadata.generator_version,
             simulator_versions=metadata.simulator_versions,
             machine=metadata.machine,
-            hashes=tier_hashes(file),
+            hashes=hashes,
             probes={key: probe(read_trajectory(file, key)) for key in quick},
         )
     write_bytes_atomically(destination, (recorded.model_dump_json(indent=1) + "\n").encode())

@@ -52,9 +52,7 @@ FLAT = 1e-12  # volume of a cell over the cube of its size
 MAX_HALVINGS = 3  # of the step, where a motion diverges
 MAX_FLIGHT_ERROR = 1e-6  # [m]
 MAX_PENETRATION = 5e-4  # [m]; the explicit solver has none, vertex block descent has springs
-MAX_STEP_RATIO = (
-    1.5  # of the way between frames at the largest speed, which is taken in frames only (stored: 1.2)
-)
+MAX_STEP_RATIO = 1.5  # of a frame at the largest speed, which is known in frames only; stored data reach 1.2
 MAX_SPEED_RATIO = 10.0  # of a fall from the highest node; ears and tips whip at up to 4
 
 TOGETHER = 64  # trajectories at once on a GPU, which a single body does not keep busy

@@ -49,6 +49,7 @@ def score(
         ConfigError: the device cannot be used.
         BenchError: predictions that are not finite.
     """
+    made_by = commit()  # asked now: the checkout may change while this predicts
     with open_file(dataset) as file:
         metadata = read_metadata(file)
         dataset_hash = content_hash(file, tier, (split,))
@@ -78,7 +79,7 @@ def score(
         keys=keys,
         trajectory_hashes=tuple(hashes[key][:HASH_DIGITS] for key in keys),
         package_version=__version__,
-        commit=commit(),
+        commit=made_by,
         machine=machine(),
         evaluation_device=device,
         evaluation_threads=torch.get_num_threads(),

@@ -103,7 +103,7 @@ def _is_of_preset(record: ResultRecord) -> bool:
 
 
 def _long_training(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
-    """What is not equal where steps are counted and minutes are not."""
+    """What to ask of its minutes and steps: only the budget of a model that the board has is compared as such."""
     own = record.checkpoint
     others = [
         peer.checkpoint

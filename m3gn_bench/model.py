@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
 
 from m3gn_bench.data import Body, Case, Context
-from m3gn_bench.datasets.errors import unknown_name
+from m3gn_bench.datasets.errors import first_problem, unknown_name
 from m3gn_bench.datasets.plugins import load, plugins, usable
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.tasks import Task
@@ -254,9 +254,7 @@ def _validated(kind: type[C], section: str, values: dict[str, Any]) -> C:
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, (section, *first["loc"])))
-        raise ConfigError(f"configuration key {key}: {first['msg']}") from error
+        raise ConfigError(f"configuration key {first_problem(error, section)}") from error
 
 
 def build_model(config: RunConfig, task: Task, seed: int = 0) -> Model:

@@ -396,10 +396,10 @@ def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: st
             "another --track"
         )
     usual = load_preset(config.model_name, config.preset, get_task(found.task))
-    if not variant and found.config_hash != usual.hash():
+    if not variant and (found.materials or found.config_hash != usual.hash()):
         raise ConfigError(
-            f"{folder} was trained with other settings than preset {config.preset!r} has; name what differs with "
-            "--variant"
+            f"{folder} was trained with other settings than preset {config.preset!r} has, or on some materials only; "
+            "name what differs with --variant"
         )
 
 

@@ -108,7 +108,7 @@ def train(
         "threads": threads,
         "package_version": __version__,
     }
-    # What is usual goes without saying.
+    # Said only where it is so: states from before it could be said are those of the usual run.
     if group.size > 1:
         describe["processes"] = group.size
     if materials:

@@ -656,11 +656,13 @@ def test_a_record_is_not_replaced_by_accident(
     other = tmp_path / "other"
     shutil.copytree(folder, other)
     description = other / "checkpoint.json"
-    description.write_text(description.read_text().replace('"config_hash": "', '"config_hash": "0'))
-    with pytest.raises(SystemExit) as stop:
-        run([*score, "--checkpoint", str(other), "--replace"])
-    assert stop.value.code == 2
-    assert "name what differs with --variant" in " ".join(capsys.readouterr().err.split())
+    honest = json.loads(description.read_text())
+    for changes in ({"config_hash": "0" + honest["config_hash"]}, {"materials": {"youngs_modulus": [10.0]}}):
+        description.write_text(json.dumps(honest | changes))
+        with pytest.raises(SystemExit) as stop:
+            run([*score, "--checkpoint", str(other), "--replace"])
+        assert stop.value.code == 2
+        assert "name what differs with --variant" in " ".join(capsys.readouterr().err.split())
 
 
 def test_evaluation_is_deterministic(

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from m3gn_bench.datasets.errors import DatasetError
+from m3gn_bench.datasets.errors import DatasetError, first_problem
 from m3gn_bench.datasets.imports.source import (
     Facts,
     Found,
@@ -153,7 +153,7 @@ def _read_meta(path: Path) -> Meta:
         with reading(path):
             return Meta.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise _misfit(path, error, "") from error
+        raise DatasetError(f"{path} does not fit: {first_problem(error)}") from error
 
 
 def _used_features(meta: Meta, path: Path) -> dict[str, UsedFeature]:
@@ -173,10 +173,6 @@ def _used_features(meta: Meta, path: Path) -> dict[str, UsedFeature]:
         try:
             used[name] = UsedFeature.model_validate(feature.model_dump())
         except ValidationError as error:
-            raise _misfit(path, error, f"features.{name}.") from error
+            problem = first_problem(error, "features", name)
+            raise DatasetError(f"{path} does not fit: {problem}") from error
     return used
-
-
-def _misfit(path: Path, error: ValidationError, place: str) -> DatasetError:
-    first = error.errors()[0]
-    return DatasetError(f"{path} does not fit: {place}{'.'.join(map(str, first['loc']))}: {first['msg']}")
