@@ -169,6 +169,7 @@ def sink(trajectory: Trajectory, depth: float) -> None:
             lambda t: t.positions.__iadd__(np.float32([0, 0, 0.3])),
             r"frame 0: its lowest point is 0.32 m above",
         ),
+        (lambda t: t.positions[2].__iadd__(np.float32([0, 0, 2e-3])), "frame 2: it does not fall freely"),
         (lambda t: t.positions[60:].__iadd__(np.float32([1, 0, 0])), "frame 60: a node jumps by 1"),
         (lambda t: sink(t, 1e-5), "frame 90: a node is 1e-05 m below the floor"),
         (lambda t: t.diagnostics.update(energy_growth=0.02), "energy grows by 2.00%"),

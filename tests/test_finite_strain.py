@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from skfem import ElementHexS2, ElementQuad1, ElementQuadS2, ElementTetP1, Mesh, MeshHex, MeshQuad, MeshTet
 
 from m3gn_bench.generators.errors import SolverError
@@ -257,6 +258,9 @@ def test_contact_pushes_as_hard_as_it_is_pushed(solid: Solid) -> None:
 # --- time -------------------------------------------------------------------------------------------------
 
 
+DENSITY, DAMPING = 1.0, 0.3
+
+
 def shaken() -> ImplicitDynamics:
     """One element whose base is shaken sideways, by 0.05 sin^2(pi t), and which follows as an oscillator."""
     potential = potential_of(Solid(MeshQuad(), ElementQuad1(), integration_order=3))
@@ -264,8 +268,8 @@ def shaken() -> ImplicitDynamics:
     return ImplicitDynamics(
         potential,
         ModifiedNewton(potential, tolerance=1e-10),
-        density=1.0,
-        damping=0.3,
+        density=DENSITY,
+        damping=DAMPING,
         prescribed=lambda time: np.where(sideways, 0.05 * np.sin(np.pi * time) ** 2, 0.0),
     )
 
@@ -287,6 +291,37 @@ def test_time_integration_is_of_second_order(changing: bool) -> None:
     errors = [np.linalg.norm(a - b) for a, b in pairwise(ends)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert ((orders > 1.85) & (orders < 2.15)).all(), orders
+
+
+def test_time_integration_solves_the_equation_of_motion() -> None:
+    """The end is that of a Runge-Kutta method on rho M (a + alpha v) + f(u) = 0, with the base's movement by hand."""
+    dynamics = shaken()
+    body, law = dynamics.potential.body, dynamics.potential.law
+    solid, constrained = body.solid, body.constrained
+    (order,) = solid.element_dofs
+    mass, free = np.zeros((solid.dofs,) * 2), np.setdiff1d(np.arange(solid.dofs), constrained)
+    mass[np.ix_(order, order)] = DENSITY * solid.element_mass_matrices()[0]
+    sideways = constrained[constrained % 2 == 0]
+
+    def whole(time: float, state: Array) -> tuple[Array, Array]:
+        u, v = np.zeros((2, solid.dofs))
+        u[free], v[free] = np.split(state, 2)
+        u[sideways], v[sideways] = 0.05 * np.sin(np.pi * time) ** 2, 0.05 * np.pi * np.sin(2 * np.pi * time)
+        return u, v
+
+    def rate(time: float, state: Array) -> Array:
+        u, v = whole(time, state)
+        force, base = np.zeros((2, solid.dofs))
+        force[order] = solid.element_forces(solid.response(u, law))[0]
+        base[sideways] = 0.1 * np.pi**2 * np.cos(2 * np.pi * time)
+        pull = mass @ (base + DAMPING * v) + force
+        return np.concatenate([v[free], np.linalg.solve(mass[np.ix_(free, free)], -pull[free])])
+
+    exact = solve_ivp(rate, (0.0, 2.0), np.zeros(2 * len(free)), rtol=1e-8, atol=1e-10)
+    expected, _ = whole(2.0, exact.y[:, -1])
+    for k in range(10):
+        dynamics.advance(0.2 * (k + 1), 64, f"frame {k}")
+    assert np.abs(dynamics.displacement - expected).max() < 2e-3 * np.abs(expected).max()
 
 
 def pressed(rate: float, max_iterations: int, tolerance: float = 1e-8) -> ImplicitDynamics:

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from model_cases import make_case
@@ -12,11 +13,12 @@ from safetensors.torch import load_file
 
 import m3gn_bench.training
 from m3gn_bench.checkpoint import Checkpoint, load_checkpoint
+from m3gn_bench.data import Case
 from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.model import Model, build_model, load_preset
 from m3gn_bench.tasks import get_task
-from m3gn_bench.training import STATE, Progress, train
+from m3gn_bench.training import STATE, Progress, Run, train
 
 TASK = get_task("sheet_deformation")
 LEARNED = ["m3gn", "mgn", "mgn_material"]
@@ -108,6 +110,61 @@ def test_frozen_weights_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(m3gn_bench.training, "build_model", build)
     run("mgn", tmp_path, 3, **{"training.weight_decay": 0.5})
     assert (made[0].get_parameter(frozen) == 0.25).all()
+
+
+def first_steps(out: Path, **settings: object) -> Run:
+    """A run of 100 steps before its first one."""
+    config = load_preset("mgn", "smoke", TASK, {"training.steps": 100, **settings})
+    model = build_model(config, TASK, seed=0)
+    model.prepare(CASES)
+    return Run(config, model, 0, out, {})
+
+
+def test_learning_rate_warms_up_and_falls_as_a_cosine(tmp_path: Path) -> None:
+    settings = {
+        "training.learning_rate": 0.01,
+        "training.warmup_steps": 10,
+        "training.cosine_decay": True,
+    }
+    run = first_steps(tmp_path, **settings)
+    rates = []
+    for _ in range(101):
+        rates.append(run.learning_rate())
+        run.account(0.0)
+    cosine = [0.005 * (1 + math.cos(math.pi * step / 100)) for step in range(101)]
+    assert rates[:10] == pytest.approx([(step + 1) / 10 * cosine[step] for step in range(10)])
+    assert rates[10:] == pytest.approx(cosine[10:])
+    assert first_steps(tmp_path, **settings | {"training.cosine_decay": False}).learning_rate() == 0.001
+
+
+def test_gradient_is_clipped(tmp_path: Path) -> None:
+    norms = []
+    for clip in (1e3, 1e-3):
+        run = first_steps(tmp_path, **{"training.gradient_clip": clip})
+        run.step(CASES)
+        assert run.weights.grad is not None
+        norms.append(float(run.weights.grad.norm()))
+    assert 1e-2 < norms[0] < 1e3
+    assert norms[1] == pytest.approx(1e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_precision_is_that_of_the_settings(
+    precision: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = first_steps(tmp_path, **{"training.precision": precision})
+    loss, active = run.model.training_loss, []
+
+    def watched(case: Case, rng: np.random.Generator) -> torch.Tensor:
+        active.append(torch.is_autocast_enabled("cpu"))
+        return loss(case, rng)
+
+    monkeypatch.setattr(run.model, "training_loss", watched)
+    before = run.weights.detach().clone()
+    run.step(CASES)
+    assert active == [precision == "bfloat16"]
+    assert run.weights.dtype == torch.float32
+    assert not torch.equal(run.weights, before)
 
 
 def test_time_budget_ends(tmp_path: Path) -> None:
