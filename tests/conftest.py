@@ -17,7 +17,6 @@ from skfem import MeshTet
 
 from m3gn_bench.datasets.schema import DATASET_SEED, SMALL_TIERS, SPLITS, Metadata, Tier, trajectory_key
 from m3gn_bench.datasets.trajectory import FIXED, FREE, VTK_TETRA, Mesh, Trajectory
-from m3gn_bench.datasets.validator import cell_volumes
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.generate import generate
 from m3gn_bench.generators.scene import get_scene
@@ -47,11 +46,9 @@ def box_of_tetrahedra(
     size: tuple[float, float, float], cells: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and tetrahedra of positive volume, six to each cell of a box; its lower corner is the origin."""
-    mesh = MeshTet.init_tensor(*[np.linspace(0, s, n + 1) for s, n in zip(size, cells, strict=True)])
-    vertices, tetrahedra = mesh.p.T.copy(), mesh.t.T.astype(np.int32)
-    inverted = cell_volumes(vertices, tetrahedra, VTK_TETRA) < 0
-    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
-    return vertices, tetrahedra
+    ticks = (np.linspace(0, s, n + 1) for s, n in zip(size, cells, strict=True))
+    mesh = MeshTet.init_tensor(*ticks).oriented()
+    return mesh.p.T.copy(), np.ascontiguousarray(mesh.t.T, np.int32)
 
 
 class TetraWriter(Protocol):

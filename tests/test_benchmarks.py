@@ -1,8 +1,11 @@
-"""What `benchmarks` compares computes the same."""
+"""What `benchmarks` compares computes the same, and what plans read of it is there."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pace
 import pytest
 import torch
 from model_cases import make_case, training_cases
@@ -16,6 +19,7 @@ from usual_m3gn import PlainM3GN
 from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.scene import get_scene
+from m3gn_bench.leaderboard.pace import read_pace
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.movement_primitives import ProDMP
 from m3gn_bench.tasks import get_task
@@ -137,3 +141,20 @@ def test_bodies_turned_about_the_vertical_go_the_same_way_in_their_own_axes() ->
     assert np.allclose(inputs[0], inputs[1], atol=1e-6)
     assert np.abs(paths[0]).max() > 0.1
     assert np.allclose(paths[0], paths[1], atol=1e-3)
+
+
+def test_paces_are_measured_for_every_model(
+    smoke_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a plan reads them."""
+    monkeypatch.setattr(pace, "TURNS", 1)
+    monkeypatch.setattr(pace, "SECONDS", 0.0)
+    threads = torch.get_num_threads()
+    models = {("smoke", "sheet_deformation"): ["m3gn", "mgn"]}
+    found = pace.measure("smoke", "sheet_deformation", models, "smoke", smoke_file.parent)
+    torch.set_num_threads(threads)
+    path = tmp_path / "pace.jsonl"
+    path.write_text(json.dumps({"preset": "smoke", "task": "sheet_deformation", **found}) + "\n")
+    known = read_pace(path)
+    for model in models["smoke", "sheet_deformation"]:
+        assert known.steps("smoke", "sheet_deformation", model, 10) > 100

@@ -311,7 +311,9 @@ def test_runs_on_other_materials_have_folders_of_their_own(smoke_file: Path, tmp
 def test_presets_have_the_rates_of_the_trials() -> None:
     """The best of each method's own; a rate that nobody tried is nobody's."""
     trials = [record for record in read_records() if record.track == "tuning"]
-    for model in {record.model for record in trials}:
+    tried = {record.model for record in trials}
+    assert tried == {run.config.model_name for run in read_plan(PLANS / "tuning.toml")}
+    for model in tried:
         own = [record for record in trials if record.model == model]
         for task in TASKS.values():
             of_scene = [record for record in own if TASKS[record.task].scene == task.scene]

@@ -31,6 +31,8 @@ from m3gn_bench.datasets.trajectory import Mesh, Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.sheet_deformation import YOUNGS_MODULI, SheetDeformation
+from m3gn_bench.sources import find_or_generate
+from m3gn_bench.tasks import get_task
 
 TASK = "tetra_task"
 
@@ -250,6 +252,7 @@ def folder(
     write_tetra(folder / "tetra-smoke-test-fast.h5", only=test_keys, metadata=metadata(fidelity="fast"))
     write_tetra(folder / "tetra-smoke-test-seed7.h5", only=test_keys, metadata=metadata(seed=7))
     write_tetra(folder / "tetra-other.h5", only=test_keys, metadata=metadata(scene="other"))
+    write_tetra(folder / "tetra-old.h5", only=test_keys, metadata=metadata(dataset_version="0.9"))
     (folder / "tetra-truncated.h5").write_bytes(smoke.read_bytes()[:5000])
     (folder / "tetra-text.h5").write_text("no dataset")
     (folder / "tetra-folder.h5").mkdir()
@@ -284,8 +287,29 @@ def test_tiers_are_prefixes(folder: Path) -> None:
 def test_smallest_suitable_file_is_found(
     folder: Path, tier: str, splits: tuple[str, ...], expected: str | None
 ) -> None:
-    found = find_dataset(folder, "tetra", tier, splits)
+    found = find_dataset(folder, "tetra", tier, splits, "1.0")
     assert (found and found.name) == expected
+
+
+def test_data_of_an_older_version_are_found_by_whom_asks_for_them(folder: Path) -> None:
+    for version in ("0.9", None):
+        found = find_dataset(folder, "tetra", "smoke", ["test"], version)
+        assert found == folder / "tetra-old.h5"
+    assert find_dataset(folder, "tetra", "smoke", ["test"], "0.8") is None
+
+
+def test_data_of_an_older_version_are_simulated_again(smoke_file: Path, tmp_path: Path) -> None:
+    """What commands read without being told which file is of the present version, or is made."""
+    task = get_task("sheet_deformation")
+    path = tmp_path / smoke_file.name
+    shutil.copy(smoke_file, path)
+    assert find_or_generate(task, "smoke", tmp_path, splits=["test"]) == path
+    with h5py.File(path, "r+") as file:
+        file.attrs["dataset_version"] = np.bytes_("0.9")
+    again = find_or_generate(task, "smoke", tmp_path, splits=["test"])
+    assert again == tmp_path / "sheet_deformation-smoke-test.h5"
+    with open_file(again) as file, open_file(smoke_file) as original:
+        assert content_hash(file, "smoke", ["test"]) == content_hash(original, "smoke", ["test"])
 
 
 def test_nothing_is_found_in_no_folder(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matrices import dense
 from scipy.integrate import solve_ivp
 from skfem import ElementHexS2, ElementQuad1, ElementQuadS2, ElementTetP1, Mesh, MeshHex, MeshQuad, MeshTet
 
@@ -13,7 +14,7 @@ from m3gn_bench.generators.solvers.contact import BoundaryPoints, Disc, PenaltyC
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean, Response, Setting, Solid
 from m3gn_bench.generators.solvers.newton import ModifiedNewton
-from m3gn_bench.generators.solvers.sparse import Array, BandedAssembler
+from m3gn_bench.generators.solvers.sparse import Array
 
 E = 10.0
 MATERIALS = [-0.9, 0.0, 0.49]
@@ -209,17 +210,6 @@ def test_patch(solid: Solid) -> None:
 
 
 # --- the incremental potential ----------------------------------------------------------------------------
-
-
-def dense(assembler: BandedAssembler, banded: np.ndarray) -> np.ndarray:
-    """The assembled matrix, from its definition as a map."""
-    factor_order = assembler._order
-    lower = np.zeros((assembler.unknowns,) * 2)
-    for offset, diagonal in enumerate(banded):
-        lower += np.diag(diagonal[: assembler.unknowns - offset], -offset)
-    matrix = np.empty_like(lower)
-    matrix[np.ix_(factor_order, factor_order)] = lower + lower.T - np.diag(banded[0])
-    return matrix
 
 
 @pytest.mark.parametrize("poisson_ratio", MATERIALS)

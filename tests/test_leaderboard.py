@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 
-from m3gn_bench import sources
+from m3gn_bench import leaderboard_commands, sources
 from m3gn_bench.checkpoint import read_description
 from m3gn_bench.cli import run
 from m3gn_bench.datasets.errors import BenchError
@@ -286,12 +285,15 @@ def test_repeated_checks_sample_every_record(count: int) -> None:
 
 def test_repeated_checks_come_to_every_trajectory() -> None:
     """Of every record, with the command's own numbers, though those have common factors with the board's."""
+    options = {option.name: option.default for option in leaderboard_commands.check_command.params}
     records = [record for record in read_records() if record.ships][:55]
     seen: dict[str, set[int]] = {}
     for day in range(739_000, 739_000 + 5 * 45):
-        sampled, rounds = check.sample(records, 12, day)
+        sampled, rounds = check.sample(records, options["count"], day)
         for one in sampled:
-            seen.setdefault(f"{one.task}/{one.name}", set()).update(check.chosen(135, 3, rounds))
+            seen.setdefault(f"{one.task}/{one.name}", set()).update(
+                check.chosen(135, options["trajectories"], rounds)
+            )
     assert seen == {f"{one.task}/{one.name}": set(range(135)) for one in records}
 
 
@@ -665,27 +667,58 @@ def test_a_record_is_not_replaced_by_accident(
         assert "name what differs with --variant" in " ".join(capsys.readouterr().err.split())
 
 
-def test_evaluation_is_deterministic(
-    board: Path, smoke_file: Path, capsys: pytest.CaptureFixture[str]
+def test_show_lists_what_is_on_record(
+    board: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=board)
-    outputs = []
-    for _ in range(2):
-        arguments = [
-            "--checkpoint",
-            str(folder),
-            "--tier",
-            "smoke",
-            "--data",
-            str(smoke_file.parent),
-            "--json",
-        ]
+    known = read_records(board)
+    monkeypatch.setattr(record, "read_records", lambda: known)
+    for task, expected in (("sheet_deformation", known), ("deformable_block", [])):
         with pytest.raises(SystemExit):
-            run(["evaluate", "--model", "mgn", "--threads", "1", *arguments])
-        outputs.append(json.loads(capsys.readouterr().out)["results"])
-    assert outputs[0] == outputs[1]
-    assert {"task", "model", "preset", "seed", "context", "mse", "mse_free_nodes", "ci95"} <= set(
-        outputs[0][0]
-    )
-    assert {"per_timestep_mse", "trajectories", "recorded_mse"} <= set(outputs[0][0])
-    assert torch.isfinite(torch.tensor([row["mse"] for row in outputs[0]])).all()
+            run(["leaderboard", "show", "--task", task, "--json"])
+        shown = json.loads(capsys.readouterr().out)["records"]
+        assert [ResultRecord.model_validate(one) for one in shown] == expected
+    with pytest.raises(SystemExit):
+        run(["leaderboard", "show"])
+    rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    numbers = {(model.strip(), int(context), float(mse)) for *_, model, _, _, _, context, mse, _ in rows}
+    assert numbers == {
+        (one.model, result.context, float(f"{result.mse * 1e6:.4g}"))
+        for one in known
+        for result in one.results
+    }
+
+
+@pytest.mark.parametrize(("model", "is_there"), [("mgn", True), ("stand_still", False)])
+def test_evaluation_repeats_what_is_on_record(
+    board: Path,
+    smoke_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    is_there: bool,
+) -> None:
+    """And shows it beside what it finds, where the board has the model."""
+    known = [record for record in read_records(board) if record.model == "mgn"]
+    monkeypatch.setattr(record, "read_records", lambda: known)
+    folder = checkpoint_folder("sheet_deformation", model, "smoke", home=board)
+    evaluate = ["evaluate", "--model", model, "--checkpoint", str(folder), "--threads", "1", "--json"]
+    evaluate += ["--tier", "smoke", "--data", str(smoke_file.parent), "--track", "test"]
+    with pytest.raises(SystemExit):
+        run(evaluate)
+    rows = json.loads(capsys.readouterr().out)["results"]
+    assert [row["context"] for row in rows] == [2, 5, 10]
+    for row, result in zip(rows, known[0].results, strict=True):
+        assert {row[name] for name in ("task", "model", "preset", "seed", "trajectories")} == {
+            "sheet_deformation",
+            model,
+            "smoke",
+            0,
+            4,
+        }
+        assert len(row["per_timestep_mse"]) == 51 - row["context"]
+        low, high = row["ci95"]
+        assert low < row["mse"] < high
+        assert row["recorded_mse"] == (pytest.approx(result.mse, rel=1e-8) if is_there else None)
+        if is_there:
+            assert row["mse"] == pytest.approx(result.mse, rel=1e-8)
+            assert row["mse_free_nodes"] == pytest.approx(result.mse_free_nodes, rel=1e-8)

@@ -25,7 +25,9 @@ def test_noise_has_its_size_and_leaves_the_true_next_position_the_target() -> No
 
     model.simulator.forward = truth  # type: ignore[method-assign, assignment]
     moments = torch.arange(1, case.frames - 1)[:, None]
-    assert model.simulator.loss(case, moments, scale, np.random.default_rng(0)) < 1e-9  # 0.04 without correction
+    assert (
+        model.simulator.loss(case, moments, scale, np.random.default_rng(0)) < 1e-9
+    )  # 0.04 without correction
 
     (state,) = shown
     movements = case.positions.diff(dim=0)

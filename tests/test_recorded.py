@@ -10,14 +10,15 @@ import pytest
 from click.testing import CliRunner
 
 from m3gn_bench.cli import cli
-from m3gn_bench.datasets import recorded
-from m3gn_bench.datasets.card import Moments
+from m3gn_bench.datasets import card, recorded
+from m3gn_bench.datasets.card import CARDS, Moments
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory, stored_hashes
 from m3gn_bench.datasets.recorded import compare, probe, read_record, record
 from m3gn_bench.datasets.schema import SMALL_TIERS, trajectory_key
 from m3gn_bench.datasets.writer import merge_shards, write_shard
-from m3gn_bench.generators.scene import scene_names
+from m3gn_bench.generators.scene import get_scene, scene_names
+from m3gn_bench.generators.sheet_deformation import SheetDeformation
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +132,11 @@ def test_moments_are_those_of_all_vectors() -> None:
 @pytest.mark.parametrize("scene", scene_names())
 def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
     found = read_record(scene)
+    assert found.dataset_version == get_scene(scene).dataset_version
     assert set(found.hashes) == {"smoke", "quick", "paper"}
     assert len(found.probes) == 96
+    card = (CARDS / f"{scene}.md").read_text()
+    assert all(digest in card for digest in found.hashes.values())
 
 
 @pytest.mark.parametrize("scene", scene_names())
@@ -153,6 +157,36 @@ def test_reproduce_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest
     found = json.loads(outcome.stdout)
     assert (found["ok"], found["identical"]) == (False, False)
     assert found["largest_difference"] == pytest.approx(1e-2, rel=1e-3)
+
+
+def test_card_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the block between the markers changes; the hashes are those of the file."""
+    shipped = (CARDS / "sheet_deformation.md").read_text()
+    (tmp_path / "sheet_deformation.md").write_text(shipped)
+    monkeypatch.setattr(card, "CARDS", tmp_path)
+    monkeypatch.setattr(recorded, "FOLDER", tmp_path)
+    outcome = CliRunner().invoke(cli, ["card", str(quick_file), "--json"])
+    assert outcome.exit_code == 0, outcome.output
+    paths = json.loads(outcome.stdout)
+    assert (Path(paths["card"]).parent, Path(paths["record"]).parent) == (tmp_path, tmp_path)
+    written = Path(paths["card"]).read_text()
+    before, middle, after = parts(written)
+    assert (before, after) == (parts(shipped)[0], parts(shipped)[2])
+    rows = middle.splitlines()
+    assert f"| trajectories | 96, tier `quick`, dataset version {SheetDeformation.dataset_version} |" in rows
+    # What there is to infer does not depend on the tier.
+    (effect,) = (row for row in rows if row.startswith("| softest against stiffest"))
+    assert effect in parts(shipped)[1].splitlines()
+    hashes = read_record("sheet_deformation", tmp_path).hashes
+    assert all(f"| content hash, {tier} | `{digest}` |" in rows for tier, digest in hashes.items())
+    assert hashes["smoke"] == read_record("sheet_deformation").hashes["smoke"]
+
+
+def parts(text: str) -> tuple[str, str, str]:
+    """Before, in and after the generated block."""
+    before, _, rest = text.partition(card.BEGIN)
+    block, _, after = rest.partition(card.END)
+    return before, block, after
 
 
 def test_reproduce_complains_before_the_work(

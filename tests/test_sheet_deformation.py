@@ -40,7 +40,10 @@ def snap(trajectory: Trajectory) -> None:
     [
         (lambda t: None, []),
         (lambda t: t.positions.__setitem__((20, 3, 1), np.nan), ["frame 20: positions are not finite"]),
-        (lambda t: t.positions.__setitem__((7, clamped(t), 2), 0.5), ["frame 7: a clamped node moves by 0.5 mm"]),
+        (
+            lambda t: t.positions.__setitem__((7, clamped(t), 2), 0.5),
+            ["frame 7: a clamped node moves by 0.5 mm"],
+        ),
         (fold, ["frame 50: a cell folds over", "frame 50: the sheet snaps"]),
         (snap, ["frame 30: the sheet snaps"]),
         (

@@ -236,7 +236,7 @@ def few_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands measure small grids, and one model."""
+    """Commands measure small grids."""
     monkeypatch.setattr("m3gn_bench.generators.knobs.knobs_of", lambda task: SMALL)
     impossible = replace(FEW, name="nu = 0.5", parameters=replace(FEW.parameters, poisson_ratios=(0.0, 0.5)))
     grid = Extremes((FEW, impossible), 0.1, None)

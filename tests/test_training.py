@@ -2,7 +2,9 @@
 
 import json
 import math
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from m3gn_bench.errors import CheckpointError, ConfigError, TrainingError
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.model import Model, build_model, load_preset
 from m3gn_bench.tasks import get_task
-from m3gn_bench.training import STATE, Progress, Run, train
+from m3gn_bench.training import STATE, Progress, Run, tensorboard_observer, train
 
 TASK = get_task("sheet_deformation")
 LEARNED = ["m3gn", "mgn", "mgn_material"]
@@ -80,6 +82,28 @@ def test_learns(name: str, tmp_path: Path) -> None:
         done = train(config, TASK, CASES, CASES, tmp_path / str(steps), seed=0, dataset_hash="none")
         errors.append(done.validation_error)
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_curves_go_to_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which need not be installed here: only where, what and how often is asked."""
+    written: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: Path) -> None:
+            assert folder == tmp_path
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            written.append((name, value, step))
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    observe = tensorboard_observer(tmp_path)
+    observe(Progress(step=99, loss=3.0))
+    observe(Progress(step=100, loss=2.0))
+    observe(Progress(step=200, loss=1.0, best_error=0.5))
+    assert written == [("loss", 2.0, 100), ("loss", 1.0, 200), ("best validation error", 0.5, 200)]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(ConfigError, match="TensorBoard is not installed"):
+        tensorboard_observer(tmp_path)
 
 
 def test_best_weights_are_kept(tmp_path: Path) -> None:

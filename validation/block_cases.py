@@ -51,11 +51,6 @@ def displacements(trajectory: Trajectory) -> Array:
     return trajectory.positions.astype(np.float64) - trajectory.mesh.rest_positions
 
 
-def relative_error(found: Array, reference: Array) -> float:
-    """Relative L2 norm."""
-    return float(np.linalg.norm(found - reference) / np.linalg.norm(reference))
-
-
 def draws_with(poisson_ratio: float, count: int) -> list[BlockParameters]:
     """Random parameters whose second ratio is this one, each with another trapezoid (of which there are nine)."""
     cycle = [draw(index) for index in range(len(TRAPEZOIDS) * len(POISSON_RATIOS))]

@@ -42,7 +42,7 @@ from threadpoolctl import threadpool_limits
 from m3gn_bench.datasets.card import CARDS, fill
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import write_bytes_atomically
-from m3gn_bench.generators.falling import FallingTeddy, FallParameters, MixedObjects
+from m3gn_bench.generators.falling import SIZE, FallingTeddy, FallParameters, MixedObjects
 from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation, SheetParameters
 from m3gn_bench.generators.solvers.sparse import Array
@@ -64,7 +64,7 @@ def relative(found: Array, usual: Array) -> float:
 
 def distance(found: Fall, usual: Fall) -> float:
     """Root mean square distance of the recorded nodes over the size, until 0.2 s after the impact."""
-    return float(np.sqrt(((found.path - usual.path) ** 2).sum(-1).mean())) / 0.5
+    return float(np.sqrt(((found.path - usual.path) ** 2).sum(-1).mean())) / SIZE
 
 
 def vibration(found: Fall, usual: Fall) -> float:
@@ -425,7 +425,7 @@ def percent(share: float) -> str:
 
 
 def load() -> dict[str, dict[str, Any]]:
-    """What is recorded, by scene and row."""
+    """What is recorded of every scene: its `dataset_version`, and its `rows`."""
     return dict(json.loads(RECORD.read_text())) if RECORD.is_file() else {}
 
 
@@ -437,7 +437,13 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     recorded = load()
     for scene in [options.scene] if options.scene else scene_names():
-        rows = recorded.setdefault(scene, {}) if options.record else {}
+        found = {"dataset_version": get_scene(scene).dataset_version, "rows": {}}
+        if options.record:
+            before = recorded.get(scene, found)
+            found = recorded[scene] = (
+                before if before["dataset_version"] == found["dataset_version"] else found
+            )
+        rows = found["rows"]
         for term in TERMS:
             if term.scene != scene or term.title in rows:
                 continue

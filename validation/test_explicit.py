@@ -28,12 +28,7 @@ DENSITY, YOUNGS_MODULUS = 1000.0, 1e6
 def beam(cells: int) -> MeshTet:
     """A beam along x, `cells` across its height, positively oriented."""
     across = np.linspace(0, HEIGHT, cells + 1)
-    mesh = MeshTet.init_tensor(np.linspace(0, LENGTH, 4 * cells + 1), across, across)
-    tetrahedra = mesh.t.copy()
-    corners = mesh.p[:, tetrahedra]
-    inverted = np.linalg.det((corners[:, 1:] - corners[:, :1]).transpose(2, 1, 0)) < 0
-    tetrahedra[1:3, inverted] = tetrahedra[2:0:-1, inverted]
-    return MeshTet(mesh.p, tetrahedra)
+    return MeshTet.init_tensor(np.linspace(0, LENGTH, 4 * cells + 1), across, across).oriented()
 
 
 def scikit_fem_sag(

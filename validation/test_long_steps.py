@@ -12,7 +12,7 @@ from m3gn_bench.datasets.schema import DATASET_SEED
 from m3gn_bench.generators.deformable_block import BASE, HEIGHT, DeformableBlock, make_block
 from m3gn_bench.generators.falling import FallingTeddy
 from m3gn_bench.generators.generate import draw
-from m3gn_bench.generators.sheet_deformation import SheetDeformation
+from m3gn_bench.generators.sheet_deformation import MIN_PRINCIPAL_STRAIN, SheetDeformation
 from m3gn_bench.generators.solvers.explicit import ExplicitSolid
 from m3gn_bench.generators.tissue_manipulation import TissueManipulation
 
@@ -36,6 +36,8 @@ def test_sheet_under_twice_the_force(youngs_modulus: float, forces: tuple[float,
     problems = scene.check(trajectory)
     print(f"E {youngs_modulus}, {forces}: {problems or 'valid'}")
     assert np.isfinite(trajectory.positions).all()
+    beyond = trajectory.diagnostics["min_principal_strain"] < MIN_PRINCIPAL_STRAIN
+    assert beyond == any("compressive membrane strain" in problem for problem in problems)
     once = scene.simulate(case(youngs_modulus, forces))
     deeper = np.abs(trajectory.positions[-1, :, 2]).max() / np.abs(once.positions[-1, :, 2]).max()
     assert 1.2 < deeper < 2.0  # it stiffens

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tissue_cases import CASES, DEFAULT, DENSITY, FAST, GRAVITY, displacements, draw, march, relative_error
+from sheet_cases import relative_error
+from tissue_cases import CASES, DEFAULT, DENSITY, FAST, GRAVITY, displacements, draw, march
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.sparse import Array

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calculix import final_displacements, needs_calculix, run_calculix
-from tissue_cases import CASES, relative_error
+from sheet_cases import relative_error
+from tissue_cases import CASES
 
 from m3gn_bench.generators.solvers.dynamics import ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean

@@ -1,7 +1,7 @@
 """The tutorial, carried out for real: its commands in an empty folder, and what it says one will see.
 
 Only the installation is left out; the commands are those of the environment that runs the tests. All of them together
-take about a minute.
+take a minute and a half.
 """
 
 import os

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import coo_matrix
-from sheet_cases import relative_error
 
 from m3gn_bench.generators.solvers.dynamics import ConstrainedSolid, ImplicitDynamics, IncrementalPotential
 from m3gn_bench.generators.solvers.finite_strain import NeoHookean
@@ -22,18 +21,6 @@ from m3gn_bench.generators.tissue_manipulation import (
     TissueParameters,
     make_slab,
 )
-
-__all__ = [
-    "CASES",
-    "DEFAULT",
-    "DENSITY",
-    "FAST",
-    "GRAVITY",
-    "displacements",
-    "draw",
-    "march",
-    "relative_error",
-]
 
 GRAVITY = 9810.0  # [mm/s^2]
 DENSITY = 1.07e-3  # [g/mm^3], of the tissue where it is not quasi-static; with it units are mm, g and s
