@@ -26,14 +26,19 @@ from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
 MAX_COMPRESSION = 1100  # gzip reaches 1032
 
 
+def require_file(path: Path) -> None:
+    """Raises DatasetError if there is no file."""
+    if not path.is_file():
+        raise DatasetError(f"no dataset file at {path}; make one with 'm3gn-bench generate'")
+
+
 def open_file(path: Path) -> h5py.File:
     """Open a dataset file for reading.
 
     Raises:
         DatasetError: missing, truncated, not HDF5, not ours, or of another schema version.
     """
-    if not path.is_file():
-        raise DatasetError(f"no dataset file at {path}; make one with 'm3gn-bench generate'")
+    require_file(path)
     try:
         file = h5py.File(path)
     except OSError as error:

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
-from m3gn_bench.datasets.file import load_trajectory, open_file, read_metadata, read_splits
+from m3gn_bench.datasets.file import load_trajectory, open_file, read_metadata, read_splits, require_file
 from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, tier_sizes, trajectory_key
 from m3gn_bench.datasets.trajectory import (
     CELL_CORNERS,
@@ -68,7 +68,12 @@ class ValidationReport(Record):
 def validate(
     path: Path, *, strict: bool = False, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> ValidationReport:
-    """Check a file. Never raises for what is in it, however damaged."""
+    """Check a file. Never raises for what is in it, however damaged.
+
+    Raises:
+        DatasetError: there is no such file.
+    """
+    require_file(path)
     problems: list[Problem] = []
     count = 0
     try:

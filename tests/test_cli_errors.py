@@ -104,6 +104,7 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         (["simulate"], ["No such command 'simulate'"]),
         (["generate"], ["Missing argument 'SCENE'"]),
         (["info", "absent.h5"], ["no dataset file at absent.h5"]),
+        (["validate", "absent.h5"], ["no dataset file at absent.h5"]),
     ],
     ids=lambda value: " ".join(value[-2:]) if isinstance(value, list) else None,
 )
@@ -176,7 +177,6 @@ def bad_files(
         ("damaged-attribute", "E002 */: .*root attributes: tier"),
         ("nan", "E005 */trajectories/test_00000: positions holds 1 numbers that are not finite"),
         ("negative-volume", r"E007 */trajectories/test_00000: .*volume -0\.\d+"),
-        ("absent", "E001 */: no dataset file at"),
     ],
 )
 def test_validate_names_the_problem(command: Command, bad_files: Path, name: str, message: str) -> None:
