@@ -86,7 +86,6 @@ def truncate(path: Path) -> None:
 
 # name: code of the first problem, its place, how to plant it
 FILE_DEFECTS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
-    "missing file": ("E001", "/", Path.unlink),
     "empty file": ("E001", "/", lambda path: path.write_bytes(b"")),
     "text file": ("E001", "/", lambda path: path.write_text("frame,x,y,z\n" * 1000)),
     "truncated file": ("E001", "/", truncate),
