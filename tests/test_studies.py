@@ -489,5 +489,17 @@ def test_recorded_stability() -> None:
     assert all(REASONED.fullmatch(cell.detail) for cell in simulated if cell.verdict == "refused")
 
 
+def test_studies_are_of_the_models_that_ship() -> None:
+    """Those of the trade-offs that name no weights are from before studies did."""
+    tradeoffs, stabilities = read_records(RECORDS)
+    judged = [(s.task, cell.subject, cell.weights_sha256) for s in stabilities for cell in s.cells]
+    timed = [(s.task, model.model, model.weights_sha256) for s in tradeoffs for model in s.models]
+    judged = [one for one in judged if one[1] != "simulator"]
+    assert judged
+    for task, model, found in [*judged, *(one for one in timed if one[2] is not None)]:
+        shipped = read_description(checkpoint_folder(task, model, "compact"))
+        assert found == shipped.weights_sha256, (task, model)
+
+
 def test_the_page_is_up_to_date() -> None:
     assert render(*read_records(RECORDS)) == (RECORDS.parent / "tradeoff.md").read_text()
