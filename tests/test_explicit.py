@@ -158,6 +158,16 @@ def test_highest_frequency(element: Element, poisson_ratio: float) -> None:
     assert body.highest_frequency == pytest.approx(np.sqrt(largest), rel=2e-3)
 
 
+@pytest.mark.parametrize("element", get_args(Element))
+def test_highest_damping_rate(element: Element) -> None:
+    """Against the eigenvalues of the matrix that takes velocities to decelerations."""
+    body = solid(cells=1, element=element, gravity=0.0, viscosity=100.0)
+    unit = np.eye(3 * body.nodes).reshape(-1, body.nodes, 3)
+    columns = [-body.accelerations(body.vertices, velocity).ravel() for velocity in unit]
+    assert body.highest_damping_rate == pytest.approx(np.linalg.eigvals(columns).real.max(), rel=2e-3)
+    assert solid(cells=1, element=element).highest_damping_rate == 0
+
+
 def test_highest_frequency_of_a_single_tetrahedron() -> None:
     """Nodal pressure is the cell's own, and K is small enough to write down."""
     E, nu, density = 3.0, 0.25, 2.0
