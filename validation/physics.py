@@ -37,6 +37,7 @@ from physics_variants import (
     without_damping,
     without_inertia,
 )
+from sheet_cases import relative_error
 from threadpoolctl import threadpool_limits
 
 from m3gn_bench.datasets.card import CARDS, fill
@@ -55,11 +56,6 @@ SEED = 29  # not the datasets'
 
 
 # -- how results are compared -------------------------------------------------------------------------------
-
-
-def relative(found: Array, usual: Array) -> float:
-    """Relative L2 difference of the displacement of all recorded nodes over the whole path."""
-    return float(np.linalg.norm(found - usual) / np.linalg.norm(usual))
 
 
 def distance(found: Fall, usual: Fall) -> float:
@@ -158,7 +154,7 @@ class Term:
     in_scene: bool
     run: Callable[[Any], Any]
     detail: str = ""
-    norm: Callable[[Any, Any], float] = relative
+    norm: Callable[[Any, Any], float] = relative_error
     draws: tuple[int, ...] | None = None
     reason: str = ""
 
@@ -425,8 +421,22 @@ def percent(share: float) -> str:
 
 
 def load() -> dict[str, dict[str, Any]]:
-    """What is recorded of every scene: its `dataset_version`, and its `rows`."""
-    return dict(json.loads(RECORD.read_text())) if RECORD.is_file() else {}
+    """What is recorded, by scene and row, of those scenes whose data have not changed since."""
+    stored = json.loads(RECORD.read_text()) if RECORD.is_file() else {}
+    return {
+        scene: found["rows"]
+        for scene, found in stored.items()
+        if found["dataset_version"] == get_scene(scene).dataset_version
+    }
+
+
+def save(recorded: dict[str, dict[str, Any]]) -> None:
+    """Keep what `load` gives."""
+    stored = {
+        scene: {"dataset_version": get_scene(scene).dataset_version, "rows": rows}
+        for scene, rows in recorded.items()
+    }
+    write_bytes_atomically(RECORD, (json.dumps(stored, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -437,21 +447,14 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     recorded = load()
     for scene in [options.scene] if options.scene else scene_names():
-        found = {"dataset_version": get_scene(scene).dataset_version, "rows": {}}
-        if options.record:
-            before = recorded.get(scene, found)
-            found = recorded[scene] = (
-                before if before["dataset_version"] == found["dataset_version"] else found
-            )
-        rows = found["rows"]
+        rows = recorded.setdefault(scene, {}) if options.record else {}
         for term in TERMS:
             if term.scene != scene or term.title in rows:
                 continue
             rows[term.title] = measured(term)
             print(f"{scene}: {term.title}", file=sys.stderr, flush=True)
             if options.record:
-                text = json.dumps(recorded, indent=1, ensure_ascii=False) + "\n"
-                write_bytes_atomically(RECORD, text.encode())
+                save(recorded)
         simulated.cache_clear()
         text = table(scene, rows)
         print(text)
