@@ -703,18 +703,17 @@ def test_evaluation_repeats_what_is_on_record(
     folder = checkpoint_folder("sheet_deformation", model, "smoke", home=board)
     evaluate = ["evaluate", "--model", model, "--checkpoint", str(folder), "--threads", "1", "--json"]
     evaluate += ["--tier", "smoke", "--data", str(smoke_file.parent), "--track", "test"]
-    with pytest.raises(SystemExit):
-        run(evaluate)
-    rows = json.loads(capsys.readouterr().out)["results"]
+    outputs = []
+    for _ in range(2):
+        with pytest.raises(SystemExit):
+            run(evaluate)
+        outputs.append(json.loads(capsys.readouterr().out)["results"])
+    rows = outputs[0]
+    assert outputs[1] == rows  # to the bit, which records do not keep
     assert [row["context"] for row in rows] == [2, 5, 10]
     for row, result in zip(rows, known[0].results, strict=True):
-        assert {row[name] for name in ("task", "model", "preset", "seed", "trajectories")} == {
-            "sheet_deformation",
-            model,
-            "smoke",
-            0,
-            4,
-        }
+        said = [row[name] for name in ("task", "model", "preset", "seed", "trajectories")]
+        assert said == ["sheet_deformation", model, "smoke", 0, 4]
         assert len(row["per_timestep_mse"]) == 51 - row["context"]
         low, high = row["ci95"]
         assert low < row["mse"] < high

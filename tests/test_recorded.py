@@ -135,8 +135,8 @@ def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
     assert found.dataset_version == get_scene(scene).dataset_version
     assert set(found.hashes) == {"smoke", "quick", "paper"}
     assert len(found.probes) == 96
-    card = (CARDS / f"{scene}.md").read_text()
-    assert all(digest in card for digest in found.hashes.values())
+    shown = (CARDS / f"{scene}.md").read_text()
+    assert all(digest in shown for digest in found.hashes.values())
 
 
 @pytest.mark.parametrize("scene", scene_names())

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from physics_variants import STANDARD_GRAVITY
 from sheet_cases import relative_error
-from tissue_cases import CASES, DEFAULT, DENSITY, FAST, GRAVITY, displacements, draw, march
+from tissue_cases import CASES, DEFAULT, DENSITY, FAST, displacements, draw, march
 
 from m3gn_bench.generators.errors import SolverError
 from m3gn_bench.generators.solvers.sparse import Array
@@ -97,7 +98,7 @@ def test_solver_tolerance_does_not_matter() -> None:
 def _amplification(parameters: TissueParameters) -> float:
     """How much further a small force across the wall moves it during the pull than without a pull."""
     level = replace(FAST, tolerance=1e-6)
-    sideways = (0.0, 1e-2 * GRAVITY, 0.0)
+    sideways = (0.0, 1e-2 * STANDARD_GRAVITY, 0.0)
     pulled, still = (
         march(replace(parameters, speed=speed), level, acceleration=sideways)
         for speed in (parameters.speed, 0.0)

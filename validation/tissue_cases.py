@@ -22,7 +22,6 @@ from m3gn_bench.generators.tissue_manipulation import (
     make_slab,
 )
 
-GRAVITY = 9810.0  # [mm/s^2]
 DENSITY = 1.07e-3  # [g/mm^3], of the tissue where it is not quasi-static; with it units are mm, g and s
 DAMPING = 20.0  # [1/s], mass-proportional, so without effect on a quasi-static pull
 DEFAULT = TissueManipulation.fidelities["default"]
