@@ -1,5 +1,6 @@
 """Open dataset files and read what is in them; nothing is returned that does not match its hash."""
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,9 +28,11 @@ MAX_COMPRESSION = 1100  # gzip reaches 1032
 
 
 def require_file(path: Path) -> None:
-    """Raises DatasetError if there is no file."""
+    """Raises DatasetError if there is no file, or none that may be read."""
     if not path.is_file():
         raise DatasetError(f"no dataset file at {path}; make one with 'm3gn-bench generate'")
+    if not os.access(path, os.R_OK):
+        raise DatasetError(f"{path} may not be read: its permissions do not allow it")
 
 
 def open_file(path: Path) -> h5py.File:

@@ -29,6 +29,7 @@ from m3gn_bench.datasets.errors import DatasetError, unknown_name
 FORMAT = "m3gn-bench dataset"
 SCHEMA_VERSION = 1
 DATASET_SEED = 2025  # the leaderboard's
+LARGEST_SEED = 2**63 - 1  # that an attribute of HDF5 holds
 NO_SEED = -1  # of data that were not drawn here
 IMPORTED = "imported"  # in a variant: the layout that the data of others had
 

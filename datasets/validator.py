@@ -12,7 +12,7 @@ import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import load_trajectory, open_file, read_metadata, read_splits, require_file
-from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, tier_sizes, trajectory_key
+from m3gn_bench.datasets.schema import SPLITS, Metadata, Record, parse_key, tier_sizes, trajectory_key
 from m3gn_bench.datasets.trajectory import (
     CELL_CORNERS,
     FIXED,
@@ -35,6 +35,7 @@ CODES = {
     "E010": "splits do not fit the trajectories or overlap",
     "W001": "the file does not hold its whole tier",
     "W002": "the file holds something that the schema does not know",
+    "W003": "the same trajectory is in two splits",
 }
 TRAJECTORY_GROUP = {
     "positions",
@@ -240,6 +241,12 @@ def _file_problems(
     unlisted = present - {key for splits in tasks.values() for keys in splits.values() for key in keys}
     if unlisted:
         yield Problem(code="E010", where="/splits", message=f"{min(unlisted)} is in no split of any task")
+    first: dict[str, str] = {}
+    for key, digest in hashes.items():
+        other = first.setdefault(digest, key)
+        if parse_key(key)[0] != parse_key(other)[0]:
+            message = f"{key} is the same as {other}"
+            yield Problem(code="W003", where=f"/trajectories/{key}", message=message)
     sizes = tier_sizes(metadata.tier, metadata.paper_sizes)
     absent = [
         key

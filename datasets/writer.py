@@ -41,7 +41,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise DatasetError(f"cannot write {path}: {error.strerror or error}") from error
+        read = error.filename and Path(error.filename) not in {path, temporary, path.parent}
+        what = f"{error.strerror} ({error.filename})" if read else error.strerror or error
+        raise DatasetError(f"cannot write {path}: {what}") from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -63,18 +65,27 @@ def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
         place: what a user knows it by, for the message.
 
     Raises:
-        DatasetError: another process has it, or it cannot be written.
+        DatasetError: another process has it, or it cannot be written or locked.
     """
+    busy = DatasetError(f"another process {doing} in {place}; wait until it has finished")
+    path = folder / "lock"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("w")
+        lock = path.open("w")
     except OSError as error:
         raise DatasetError(f"cannot write to {place}: {error.strerror or error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Whoever had it may have deleted the folder when all was done: then this is the lock of nothing.
+            if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                raise busy
         except BlockingIOError:
-            raise DatasetError(f"another process {doing} in {place}; wait until it has finished") from None
+            raise busy from None
+        except OSError as error:
+            raise DatasetError(
+                f"{place} cannot be locked ({error.strerror or error}); choose a folder on a file system with locks"
+            ) from error
         yield
 
 

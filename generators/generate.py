@@ -13,9 +13,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from m3gn_bench.datasets.errors import DatasetError, unknown_name
-from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory
+from m3gn_bench.datasets.file import open_file, read_metadata, read_splits, read_trajectory
 from m3gn_bench.datasets.schema import (
     DATASET_SEED,
+    LARGEST_SEED,
     SPLITS,
     Fidelity,
     Metadata,
@@ -157,7 +158,7 @@ def generate(
         fidelity: "fast", "default" or "reference".
         seed: of the dataset; leaderboards use the default.
         executor: what runs the workers; see `run_jobs`. With a cluster, `out` must be a folder that all workers see.
-        on_progress: called with (done, total) after every trajectory.
+        on_progress: called with (done, total) at first, and whenever some are done.
 
     Raises:
         GeneratorError: unknown names, a trajectory that cannot be made, or one that the validator would find fault
@@ -168,8 +169,8 @@ def generate(
         raise GeneratorError(unknown_name("fidelity", fidelity, list(scene.fidelities)))
     if workers < 1:
         raise GeneratorError(f"workers must be at least 1, not {workers}")
-    if seed < 0:
-        raise GeneratorError(f"the seed must not be negative, as {seed} is")
+    if not 0 <= seed <= LARGEST_SEED:
+        raise GeneratorError(f"the seed must be between 0 and {LARGEST_SEED}, which {seed} is not")
     parse_executor(executor)
     if not splits:
         raise GeneratorError("there is no split to make")
@@ -190,7 +191,7 @@ def generate(
         for left_by_killed_run in out.glob(f".{path.name}.*.tmp"):
             left_by_killed_run.unlink()
         todo: list[str] = []
-        if not _is_complete(path, list(wanted), metadata):
+        if not _is_dataset(path, list(wanted), metadata):
             todo = [key for key in wanted if not _is_complete(shards[key], [key], metadata)]
             done = len(wanted) - len(todo)
             on_progress(done, len(wanted))
@@ -213,10 +214,10 @@ def generate(
         with open_file(path) as file:
             made = read_metadata(file)
             seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
-        for shard in shards.values():
-            shard.unlink(missing_ok=True)
-        if not any(shard_folder.glob("*.h5")):  # else a run of a larger tier was interrupted, and may go on
-            shutil.rmtree(shard_folder)
+        if set(shard_folder.glob("*.h5")) <= set(
+            shards.values()
+        ):  # else a larger tier was interrupted: it may go on
+            shutil.rmtree(shard_folder, ignore_errors=True)  # somebody else may just look for the lock
     return GenerationReport(
         path, made.content_hash, len(wanted), list(made.rejections), float(np.mean(seconds)), len(todo)
     )
@@ -243,6 +244,18 @@ def _metadata(scene: Scene, tier: str, fidelity: Fidelity, seed: int) -> Metadat
         scale_length=scene.scale_length,
         machine=machine(),
     )
+
+
+def _is_dataset(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:
+    """Whether a whole dataset of an earlier run of this generator holds these, and lists them in its splits."""
+    if not _is_complete(path, keys, metadata):
+        return False
+    try:
+        with open_file(path) as file:
+            tasks = read_splits(file)
+    except DatasetError:
+        return False
+    return set(keys) == {key for splits in tasks.values() for listed in splits.values() for key in listed}
 
 
 def _is_complete(path: Path, keys: Sequence[str], metadata: Metadata) -> bool:

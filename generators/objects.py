@@ -9,10 +9,12 @@ import hashlib
 import importlib
 import io
 import json
+import os
+import secrets
 import zipfile
 import zlib
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
@@ -230,7 +232,13 @@ def read_or_keep_object(path: Path, folder: Path) -> SoftBody:
         return read_object(path)
     kept = folder / f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:8]}.npz"
     if not kept.is_file():
-        write_object(read_object(path), kept)
+        own = kept.with_stem(f".{kept.stem}-{secrets.token_hex(8)}")
+        write_object(read_object(path), own)
+        try:
+            with suppress(FileExistsError):  # of two runs at once, the first to finish keeps it for both
+                os.link(own, kept)
+        finally:
+            own.unlink()
     return replace(read_object(kept), name=path.stem)
 
 

@@ -69,7 +69,8 @@ def _run_here(function: Callable[[Job], Made], jobs: Iterable[Job], workers: int
         pool.shutdown()  # all done: let workers end by themselves, before the pipe tells them to
     except BrokenProcessPool as error:
         raise GeneratorError(
-            "a worker process died (out of memory, or killed); run the same command again to go on"
+            "a worker process died: out of memory, or killed (run the same again to go on), or the script that called "
+            "this does not guard its start by `if __name__ == '__main__':`, and every worker started it again"
         ) from error
     finally:
         parent_lives.close()

@@ -1,7 +1,9 @@
 """The command line. Exit codes: 0 fine, 1 something was found wrong, 2 could not run, 130 interrupted."""
 
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,8 @@ def cli() -> None:
 def run(arguments: Sequence[str] | None = None) -> None:
     """Entry point: turns every error that a user can act on into one line and an exit code."""
     try:
-        sys.exit(cli.main(args=arguments, prog_name="m3gn-bench", standalone_mode=False))
+        with _termination_interrupts():
+            sys.exit(cli.main(args=arguments, prog_name="m3gn-bench", standalone_mode=False))
     except click.ClickException as error:
         error.show()
         sys.exit(2)
@@ -45,6 +48,16 @@ def run(arguments: Sequence[str] | None = None) -> None:
             f"error: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", err=True
         )
         sys.exit(2)
+
+
+@contextmanager
+def _termination_interrupts() -> Iterator[None]:
+    """`timeout`, a batch system or a shutdown end a command as Ctrl-C does: temporary files go, workers end."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @cli.command("list")

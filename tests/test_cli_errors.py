@@ -83,6 +83,7 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         (["generate", TASK, "--workers", "0"], ["0 is not in the range x>=1"]),
         (["generate", TASK, "--workers", "two"], ["'two' is not a valid integer"]),
         (["generate", TASK, "--seed", "-1"], ["--seed"]),
+        (["generate", TASK, "--seed", str(2**63)], ["between 0 and 9223372036854775807"]),
         ([*TRAIN, "--task", "bending"], ["task 'bending'", "known: deformable_block, falling_teddy,"]),
         ([*TRAIN, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
         ([*TRAIN, "--preset", "big"], ["preset 'big'", "known: compact, paper, smoke"]),

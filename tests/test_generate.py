@@ -1,9 +1,12 @@
 """A dataset is the same however it is made, and whatever happens on the way leaves no half-made file."""
 
+import errno
+import fcntl
 import json
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import patch
 
 import h5py
 import numpy as np
@@ -22,6 +26,7 @@ from m3gn_bench.datasets.file import content_hash, find_dataset, open_file, read
 from m3gn_bench.datasets.schema import DATASET_SEED, SPLITS
 from m3gn_bench.datasets.trajectory import FREE, VTK_TETRA, Mesh, Trajectory
 from m3gn_bench.datasets.validator import validate
+from m3gn_bench.datasets.writer import reserved
 from m3gn_bench.generators.errors import GeneratorError, SolverError
 from m3gn_bench.generators.generate import MAX_ATTEMPTS, draw, generate, simulate_one
 from m3gn_bench.generators.scene import get_scene
@@ -240,7 +245,7 @@ def test_a_smaller_tier_leaves_an_interrupted_larger_one_alone(fake: FakeScene, 
     with pytest.raises(KeyboardInterrupt):
         generate(fake, "quick", tmp_path, on_progress=stop_after(20))
     assert generate(fake, "smoke", tmp_path).generated == 16 - 8  # the first 20 are of the training split
-    assert generate(fake, "quick", tmp_path).generated == 96 - (20 - 8)
+    assert generate(fake, "quick", tmp_path).generated == 96 - 20 - 8  # nothing is made twice
     assert left_in(tmp_path) == {"fake-smoke.h5", "fake-quick.h5"}
 
 
@@ -261,6 +266,46 @@ def test_damaged_shards_are_made_again(fake: FakeScene, tmp_path: Path) -> None:
     with h5py.File(shards[1], "r+") as file:
         file["trajectories/train_00001/positions"][0, 0, 0] = 9
     assert generate(fake, "smoke", tmp_path).generated == 16 - 3
+
+
+def test_a_dataset_with_damaged_splits_is_made_again(fake: FakeScene, tmp_path: Path) -> None:
+    path = generate(fake, "smoke", tmp_path).file
+    whole = path.read_bytes()
+    position = whole.index(b"test_00003")
+    path.write_bytes(whole[:position] + b"T" + whole[position + 1 :])
+    assert generate(fake, "smoke", tmp_path).generated == 16
+    assert validate(path, strict=True).ok
+
+
+def test_a_lock_of_a_deleted_folder_counts_for_nothing(tmp_path: Path) -> None:
+    """Whoever opened the lock just before its holder finished, and deleted it, does not have it."""
+    folder = tmp_path / "shards"
+    taken = fcntl.flock
+
+    def finish_first(lock: Any, how: int) -> None:
+        shutil.rmtree(folder)
+        taken(lock, how)
+
+    with (
+        patch("fcntl.flock", finish_first),
+        pytest.raises(DatasetError, match="another process"),
+        reserved(folder, "waits", tmp_path),
+    ):
+        pass
+    with reserved(folder, "waits", tmp_path):
+        pass
+
+
+def test_a_file_system_without_locks_is_named(tmp_path: Path) -> None:
+    def refuse(lock: Any, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    with (
+        patch("fcntl.flock", refuse),
+        pytest.raises(DatasetError, match=r"cannot be locked \(No locks available\)"),
+        reserved(tmp_path / "shards", "waits", tmp_path),
+    ):
+        pass
 
 
 def test_two_runs_do_not_mix(fake: FakeScene, tmp_path: Path) -> None:
@@ -348,8 +393,8 @@ def test_killed_run_goes_on(run: Run, tmp_path: Path, smoke_file: Path) -> None:
 
 
 def test_interrupted_run_goes_on(run: Run, tmp_path: Path, smoke_file: Path) -> None:
-    def interrupt(process: subprocess.Popen[str]) -> None:
-        os.killpg(process.pid, signal.SIGINT)  # to the workers, too, as a terminal does
+    def interrupt(process: subprocess.Popen[str], how: Callable[[int], None]) -> None:
+        how(process.pid)
         output, errors = process.communicate(timeout=30)
         assert process.returncode == 130
         assert output == ""
@@ -359,10 +404,10 @@ def test_interrupted_run_goes_on(run: Run, tmp_path: Path, smoke_file: Path) -> 
     first = run(tmp_path, "validation")
     wait_for(tmp_path, "lock", 1, first)
     time.sleep(0.3)  # workers are importing
-    interrupt(first)
+    interrupt(first, lambda pid: os.killpg(pid, signal.SIGINT))  # to the workers, too, as a terminal does
     second = run(tmp_path, "validation")
     wait_for(tmp_path, "*.h5", 1, second)
-    interrupt(second)
+    interrupt(second, lambda pid: os.kill(pid, signal.SIGTERM))  # as a batch system does
     third = run(tmp_path, "validation")
     made = json.loads(third.communicate(timeout=120)[0])
     assert made["content_hash"] == expected_hash(smoke_file, "validation")
@@ -379,7 +424,7 @@ def test_worker_that_dies_is_reported(tmp_path: Path) -> None:
             assert worker.pid is not None
             os.kill(worker.pid, signal.SIGKILL)
 
-    with pytest.raises(GeneratorError, match=r"a worker process died.*run the same command again"):
+    with pytest.raises(GeneratorError, match=r"a worker process died.*run the same again"):
         generate(get_scene("sheet_deformation"), "smoke", tmp_path, workers=2, on_progress=kill_a_worker)
     assert multiprocessing.active_children() == []
     assert list(tmp_path.glob("*.h5")) == []

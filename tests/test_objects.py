@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import box_of_tetrahedra
 
+from m3gn_bench.generators import objects
 from m3gn_bench.generators.errors import GeneratorError
 from m3gn_bench.generators.meshes import geometry
 from m3gn_bench.generators.meshes.shapes import SHAPES
@@ -388,6 +389,27 @@ def test_published_hashes_are_complete() -> None:
         step = geometry.reference_step(body.vertices, body.tetrahedra)
         assert step > OWN_STEP
         assert entry["stable_step_seconds"] == pytest.approx(step, rel=1e-3)
+
+
+def test_two_runs_that_mesh_at_once_have_the_same_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "toy.stl"
+    path.write_text("what the two read is not what they make of it")
+    others: list[SoftBody] = []
+
+    def mesh(path: Path) -> SoftBody:
+        if path.suffix == ".npz":
+            return read_object(path)
+        if not others:  # the other run starts later, and is faster
+            others.append(box(2))
+            others.append(read_or_keep_object(path, tmp_path / "data"))
+        return box(3)
+
+    monkeypatch.setattr(objects, "read_object", mesh)
+    body = read_or_keep_object(path, tmp_path / "data")
+    assert body.content_hash() == others[1].content_hash()
+    assert len(list((tmp_path / "data").iterdir())) == 1
 
 
 def test_a_surface_is_meshed_once(tmp_path: Path) -> None:

@@ -286,9 +286,25 @@ def test_incomplete_tier_is_a_warning(tmp_path: Path, write_tetra: TetraWriter) 
     assert not validate(path, strict=True).ok
 
 
+def test_a_trajectory_in_two_splits_is_a_warning(tmp_path: Path, write_tetra: TetraWriter) -> None:
+    """Whoever is tested on what it was trained on should know; data of others may be so."""
+    written: dict[str, Trajectory] = {}
+
+    def repeat(key: str, trajectory: Trajectory) -> Trajectory:
+        written[key] = trajectory
+        return written["train_00002"] if key == "test_00001" else trajectory
+
+    path = write_tetra(tmp_path / "repeated.h5", change=repeat)
+    (problem,) = validate(path).problems
+    assert (problem.code, problem.where) == ("W003", "/trajectories/train_00002")
+    assert problem.message == "train_00002 is the same as test_00001"
+    assert validate(path).ok
+    assert not validate(path, strict=True).ok
+
+
 def test_every_code_is_planted() -> None:
     planted = {code for code, *_ in FILE_DEFECTS.values()} | {code for code, _ in CONTENT_DEFECTS.values()}
-    assert planted | {"W001"} == set(CODES)
+    assert planted | {"W001", "W003"} == set(CODES)
 
 
 def test_progress_is_reported(tetra_file: Path) -> None:

@@ -13,6 +13,9 @@ __all__ = ["wp"]
 @contextmanager
 def _native_messages_dropped() -> Iterator[None]:
     """Warp's native library writes straight to file descriptor 2, whatever its log level."""
+    if sys.stderr is None:  # closed by whoever started this: nothing can be heard
+        yield
+        return
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
