@@ -57,7 +57,7 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
 
 @contextmanager
 def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
-    """The folder, made if need be, for this process alone (the lock ends with the process).
+    """The folder, made if need be, for this process alone (the lock ends with the process); it goes if it stays empty.
 
     Args:
         folder: what to reserve.
@@ -77,7 +77,7 @@ def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Whoever had it may have deleted the folder when all was done: then this is the lock of nothing.
+            # Whoever had it may have deleted it in the end: then this is the lock of nothing.
             if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                 raise busy
         except BlockingIOError:
@@ -86,7 +86,12 @@ def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
             raise DatasetError(
                 f"{place} cannot be locked ({error.strerror or error}); choose a folder on a file system with locks"
             ) from error
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
+                folder.rmdir()
 
 
 def write_shard(path: Path, key: str, trajectory: Trajectory, metadata: Metadata) -> str:

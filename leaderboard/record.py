@@ -15,8 +15,10 @@ from m3gn_bench.datasets.errors import BenchError, first_problem
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.metrics import TrajectoryErrors
+from m3gn_bench.model import model_names
 
 HOME = Path(__file__).parent
+SHIPPED = "compact"  # preset of the reference checkpoints, of seed 0
 RECORD_SCHEMA = 3
 HASH_DIGITS = 16  # of a trajectory's content hash, enough to tell trajectories apart
 # Names become parts of file names.
@@ -162,6 +164,11 @@ def record_path(record: ResultRecord, home: Path = HOME) -> Path:
 def checkpoint_folder(task: str, model: str, preset: str, seed: int = 0, home: Path = HOME) -> Path:
     """Where the reference checkpoint that ships with the project lies."""
     return home / "checkpoints" / task / run_name(model, preset, "", seed)
+
+
+def shipped_models(task: str, preset: str = SHIPPED) -> list[str]:
+    """The models whose reference checkpoint on a task ships with the project."""
+    return [name for name in model_names() if checkpoint_folder(task, name, preset).is_dir()]
 
 
 def write_record(record: ResultRecord, home: Path = HOME) -> Path:

@@ -38,7 +38,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
         error.show()
         sys.exit(2)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted; run the same command again to go on", err=True)
+        click.echo("interrupted; run the same command again", err=True)
         sys.exit(130)
     except BenchError as error:
         click.echo(f"error: {error}", err=True)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -24,6 +25,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from m3gn_bench.provenance import usable_cores
+
 JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 DATA = click.option(
     "--data",
@@ -34,7 +37,7 @@ DATA = click.option(
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(min=1),
-    default=os.cpu_count() or 1,
+    default=usable_cores(),
     help="Processes that simulate.  [default: all cores]",
 )
 EXECUTOR = click.option(
@@ -47,6 +50,7 @@ EXECUTOR = click.option(
 )
 DEVICE = click.option("--device", default="cpu", show_default=True, help="A torch device.")
 OnProgress = Callable[[int, int], None]
+WIDE = 10_000  # columns
 
 
 class Report:
@@ -69,11 +73,16 @@ class Report:
         if self.as_json:
             click.echo(json.dumps(_finite(record), indent=2, allow_nan=False))
             return
-        shown = sys.stdout.isatty()
-        # Units in brackets are no markup.
-        console = Console(width=None if shown else 160, soft_wrap=not shown, markup=False, emoji=False)
+        plain: dict[str, Any] = {
+            "markup": False,
+            "emoji": False,
+            "highlight": False,
+        }  # units in brackets are no markup
+        # Tables are as wide as they need to be, whatever the terminal is: rich would make room by leaving out digits.
+        whole = Console(width=WIDE, soft_wrap=True, **plain)
+        sentences = Console(**plain) if sys.stdout.isatty() else whole
         for text in texts:
-            console.print(text, highlight=False)
+            (whole if isinstance(text, Table) else sentences).print(text)
 
     @contextmanager
     def progress(self, description: str) -> Iterator[OnProgress]:

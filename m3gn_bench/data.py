@@ -159,6 +159,14 @@ class Context:
         return self.size + self.horizon
 
 
+def require_context(size: int, frames: int) -> None:
+    """Raises ConfigError if so large a context of a trajectory of so many frames leaves nothing to predict."""
+    if not 2 <= size < frames:
+        raise ConfigError(
+            f"context size {size} is out of range: a trajectory of {frames} frames allows 2 to {frames - 1}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """A whole trajectory (or several of the same length) in scaled units, from which contexts are cut.
@@ -182,11 +190,7 @@ class Case:
 
     def context(self, size: int) -> Context:
         """The context of the first `size` frames. Raises ConfigError if it leaves nothing to predict."""
-        if not 2 <= size < self.frames:
-            raise ConfigError(
-                f"context size {size} is out of range: a trajectory of {self.frames} frames "
-                f"allows 2 to {self.frames - 1}"
-            )
+        require_context(size, self.frames)
         seen = self.positions[:size].clone()  # a view could be led back to the frames that follow
         return Context(self.body, seen, self.frames - size, self.collider_path, self.keys)
 

@@ -15,8 +15,6 @@ from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, Report
 if TYPE_CHECKING:
     from m3gn_bench.generators.scene import Scene
 
-SHIPPED = "compact"  # preset of the checkpoints that are drawn
-
 
 @click.command()
 @click.argument("scene_name", metavar="SCENE")
@@ -261,16 +259,16 @@ def _checkpoints(
 
     Args:
         file: the dataset file.
-        task_name: their task, or None for the first run's, or else the first one of the file's scene.
+        task_name: their task, or None for the first run's, or else the first one of the file.
         models: those whose checkpoints ship with the project.
         runs: folders of other trained models.
     """
     from m3gn_bench.checkpoint import read_description
-    from m3gn_bench.datasets.file import open_file, read_metadata
-    from m3gn_bench.errors import CheckpointError, ConfigError
-    from m3gn_bench.leaderboard.record import checkpoint_folder
-    from m3gn_bench.model import get_model_class, model_names
-    from m3gn_bench.tasks import TASKS, get_task
+    from m3gn_bench.datasets.file import open_file, read_splits
+    from m3gn_bench.errors import CheckpointError
+    from m3gn_bench.leaderboard.record import SHIPPED, checkpoint_folder, shipped_models
+    from m3gn_bench.model import get_model_class
+    from m3gn_bench.tasks import get_task
 
     described = {run: read_description(run) for run in runs}
     for name in models:
@@ -281,20 +279,15 @@ def _checkpoints(
         task = next(iter(described.values())).task
     else:
         with open_file(file) as opened:
-            scene = read_metadata(opened).scene
-        found = next((name for name, known in TASKS.items() if known.scene == scene), None)
-        if found is None:
-            raise ConfigError(f"there is no task of scene {scene}, which {file} holds, so no model either")
-        task = found
+            task = get_task(next(iter(read_splits(opened)))).name
 
     folders = {name: checkpoint_folder(task, name, SHIPPED) for name in models}
     missing = [name for name, folder in folders.items() if not folder.is_dir()]
     if missing:
-        there = [name for name in model_names() if checkpoint_folder(task, name, SHIPPED).is_dir()]
-        names = ", ".join(there)
+        names = ", ".join(shipped_models(task))
         raise CheckpointError(
             f"no checkpoint of {missing[0]} on {task} ships with the project"
-            f"{f' (there are {names})' if there else ''}; train one and pass --checkpoint"
+            f"{f' (there are {names})' if names else ''}; train one and pass --checkpoint"
         )
     for run, description in described.items():
         name = description.config.model_name
@@ -319,8 +312,8 @@ def card(file: Path, as_json: bool) -> None:
     effect = f"{material_effect(scene):.3g}"
     path = CARDS / f"{scene.name}.md"
     block = numbers(file, [("softest against stiffest material, mean squared difference, scaled", effect)])
+    recorded = record(file)  # which may refuse
     write_bytes_atomically(path, fill(path.read_text(), block).encode())
-    recorded = record(file)
     Report(as_json).finish(
         {"card": str(path), "record": str(recorded)}, f"{path}: written\n{recorded}: written"
     )

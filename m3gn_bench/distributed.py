@@ -56,8 +56,8 @@ class Group:
         """Raises ConfigError if a batch of so many trajectories has no share for every process."""
         if trajectories < self.size:
             raise ConfigError(
-                f"a batch of {trajectories} trajectories is too small for {self.size} processes; start fewer, or set "
-                f"training.batch_size to {self.size} or more"
+                f"a batch of {trajectories} trajectories is too small for {self.size} processes; start fewer, or have "
+                f"{self.size} or more in the training split and in training.batch_size"
             )
 
     def share(self, batch: Sequence[Case]) -> tuple[Case, float]:
@@ -143,12 +143,14 @@ def torchrun_group(device: str) -> Iterator[Group]:
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"several processes share the work on --device cpu or cuda, not {device}")
     own = torch.device("cpu") if device == "cpu" else torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-    if own.type == "cuda":
-        torch.cuda.set_device(own)
     try:
+        if own.type == "cuda":
+            torch.cuda.set_device(own)
         dist.init_process_group("gloo" if own.type == "cpu" else "nccl", timeout=PATIENCE)
     except (ValueError, RuntimeError) as error:
-        raise ConfigError(f"the processes cannot connect; start them with torchrun ({error})") from error
+        raise ConfigError(
+            f"the processes cannot connect, or have not a device each; start them with torchrun ({error})"
+        ) from error
     try:
         yield Group(rank, size, own)
     finally:

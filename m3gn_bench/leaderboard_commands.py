@@ -1,6 +1,5 @@
 """The commands of the leaderboard; part of the command line (see `cli`)."""
 
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from m3gn_bench.console import DATA, DEVICE, EXECUTOR, JSON, WORKERS, OnProgress, Report, table
+from m3gn_bench.provenance import usable_cores
 
 if TYPE_CHECKING:
     from m3gn_bench.leaderboard.campaign import Outcome, PlannedRun
@@ -70,7 +70,7 @@ def show(task_name: str | None, as_json: bool) -> None:
 @leaderboard.command()
 @click.option(
     "--home",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
     default=None,
     help="A leaderboard's folder.  [default: the project's own]",
 )
@@ -215,7 +215,7 @@ def check_command(
     from m3gn_bench.leaderboard.record import read_records
     from m3gn_bench.tasks import get_task
 
-    use_cpu(os.cpu_count() or 1)
+    use_cpu(usable_cores())
     if task_name is not None:
         get_task(task_name)
     records = [r for r in read_records() if task_name in (None, r.task)]
@@ -300,9 +300,12 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
     RECORD is a file that `m3gn-bench evaluate --record FOLDER` wrote.
     """
     from m3gn_bench.datasets.errors import BenchError
+    from m3gn_bench.errors import ConfigError
     from m3gn_bench.leaderboard.record import read_record, read_records, write_record
     from m3gn_bench.leaderboard.submission import Verdict, review
 
+    if not home.is_dir():
+        raise ConfigError(f"there is no leaderboard {home}, whose records this one could be compared with")
     board, path = read_records(home), None
     try:
         # Its author may have kept the checkpoint beside the record; this board does not.
@@ -334,7 +337,7 @@ def submit(record: Path, home: Path, replace: bool, as_json: bool) -> None:
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    default=os.cpu_count() or 1,
+    default=usable_cores(),
     help="Processes, each of which trains with one thread.  [default: all cores]",
 )
 @DEVICE
@@ -368,7 +371,9 @@ def campaign(
     from m3gn_bench.training import usable_device
 
     report = Report(as_json)
-    if parse_executor(executor).kind == "process":  # a cluster's workers may have what its head has not
+    if (
+        parse_executor(executor).kind == "process" and not status
+    ):  # a cluster's workers may have what its head has not
         usable_device(device)
     planned = read_plan(plan)
     versions = {run.task: dataset_version(get_task(run.task)) for run in planned}

@@ -202,6 +202,12 @@ class RunConfig(BaseModel):
 PRESETS = ("smoke", "compact", "paper")
 
 
+def require_preset(preset: str) -> None:
+    """Raises ConfigError if there is no preset of that name."""
+    if preset not in PRESETS:
+        raise ConfigError(unknown_name("preset", preset, list(PRESETS)))
+
+
 def load_preset(
     model_name: str, preset: str, task: Task, overrides: dict[str, Any] | None = None
 ) -> RunConfig:
@@ -220,8 +226,7 @@ def load_preset(
     Raises:
         ConfigError: unknown preset or key (the message lists the known ones), or a value out of range.
     """
-    if preset not in PRESETS:
-        raise ConfigError(unknown_name("preset", preset, list(PRESETS)))
+    require_preset(preset)
     model_class = get_model_class(model_name)
     values: dict[str, dict[str, Any]] = {"model": {}, "training": {}}
     if model_class.preset_file is not None:

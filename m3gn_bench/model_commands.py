@@ -1,6 +1,5 @@
 """The commands that train, score and time models; part of the command line (see `cli`)."""
 
-import os
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -11,6 +10,7 @@ import click
 from click.core import ParameterSource
 
 from m3gn_bench.console import DATA, DEVICE, JSON, WORKERS, Report, table
+from m3gn_bench.provenance import usable_cores
 
 if TYPE_CHECKING:
     from m3gn_bench.leaderboard.record import ResultRecord
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 THREADS = click.option(
     "--threads",
     type=click.IntRange(min=1),
-    default=os.cpu_count() or 1,
+    default=usable_cores(),
     help="Of torch.  [default: all cores]",
 )
 DATASET = click.option(
@@ -77,6 +77,7 @@ def train(
     """
     from m3gn_bench.data import load_cases
     from m3gn_bench.datasets.file import content_hash, open_file
+    from m3gn_bench.datasets.writer import reserved
     from m3gn_bench.distributed import torchrun_group
     from m3gn_bench.model import build_model, load_preset
     from m3gn_bench.sources import find_or_generate, given
@@ -106,6 +107,8 @@ def train(
     with open_file(path) as file:
         dataset_hash = content_hash(file, tier, ("train", "validation"))
     training, validation = (load_cases(path, spec, split, tier) for split in ("train", "validation"))
+    if group.leads:
+        click.get_current_context().with_resource(reserved(out, "trains", out))
     with report.progress(f"training {model}") as on_progress:
 
         def observe(progress: Progress) -> None:
@@ -217,20 +220,23 @@ def evaluate(
     """
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.cpu import use_cpu
+    from m3gn_bench.data import require_context
     from m3gn_bench.datasets.file import open_file, read_splits
     from m3gn_bench.datasets.schema import as_split
     from m3gn_bench.errors import CheckpointError, ConfigError
     from m3gn_bench.leaderboard.record import (
+        SHIPPED,
         Name,
         Variant,
         checkpoint_folder,
         find_record,
         read_records,
+        shipped_models,
         write_record,
     )
     from m3gn_bench.leaderboard.scoring import score
     from m3gn_bench.metrics import confidence_interval
-    from m3gn_bench.model import get_model_class, model_names
+    from m3gn_bench.model import get_model_class, require_preset
     from m3gn_bench.sources import find_or_generate, given
     from m3gn_bench.tasks import TASKS, get_task
     from m3gn_bench.training import usable_device
@@ -239,6 +245,7 @@ def evaluate(
     use_cpu(threads)
     usable_device(device)  # refused before data are simulated
     get_model_class(model)
+    require_preset(preset)
     part = as_split(split)
     sizes = None if contexts is None else _parse_contexts(contexts)
     _require_part_of_a_file_name("--track", track, Name, "letters, digits and any of . - _")
@@ -272,11 +279,16 @@ def evaluate(
             folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
         missing = [name for name, folder in folders.items() if not folder.is_dir()]
         if missing or not folders:
+            there = sorted({name for task in names for name in shipped_models(task)})
             raise CheckpointError(
                 f"no checkpoint of {model} (preset {preset}, seed {seed}) ships with the project"
                 f"{f' for {missing[0]}' if missing else ''}; train one and pass --checkpoint. "
-                f"Models: {', '.join(model_names())}"
+                f"Of preset {SHIPPED}, seed 0, there are {', '.join(there) or 'none'}"
             )
+    if sizes is not None and dataset is None:
+        for size in sizes:
+            for name in folders:
+                require_context(size, get_task(name).frames)
 
     if record_home is None and (variant or replace):
         raise ConfigError("--variant and --replace say what --record does, which is not given")
@@ -318,6 +330,8 @@ def evaluate(
             write_record(record, record_home)
         # Trajectories of another file may have the names of the board's.
         reference = None if dataset else find_record(recorded, track, name, record.name)
+        if reference and reference.dataset_version != record.dataset_version:
+            reference = None  # of other trajectories
         rows += [
             {
                 "task": name,
@@ -473,8 +487,8 @@ def profile(
     import torch
 
     from m3gn_bench.cpu import use_cpu
-    from m3gn_bench.data import load_cases
-    from m3gn_bench.model import get_model_class
+    from m3gn_bench.data import load_cases, require_context
+    from m3gn_bench.model import load_preset
     from m3gn_bench.profiling import profile_models, ratios
     from m3gn_bench.published import published_parameters
     from m3gn_bench.sources import find_or_generate
@@ -484,15 +498,16 @@ def profile(
     report = Report(as_json)
     use_cpu(threads)
     task = get_task(task_name)
+    frames = task.context_sizes[0] if context is None else context
+    require_context(frames, task.frames)
     for name in models:
-        get_model_class(name)
+        load_preset(name, preset, task)
     where = usable_device(device)
     with report.progress(f"simulating {task.scene}") as on_progress:
         path = find_or_generate(
             task, tier, data, splits=("train", "test"), workers=workers, on_progress=on_progress
         )
     cases = load_cases(path, task, "test", tier)[:trajectories]
-    frames = task.context_sizes[0] if context is None else context
     with report.progress("profiling") as on_progress:
         profiles = profile_models(
             models,

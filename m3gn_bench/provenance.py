@@ -1,10 +1,14 @@
 """What made a number: the commit of the code, and the machine."""
 
+import hashlib
 import os
 import platform
 import subprocess
 from functools import cache
 from pathlib import Path
+
+# What the leaderboard holds is what is being made: it changes no number.
+CODE = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/*.md"]
 
 
 @cache  # what a process has imported stays what it was when it was asked first
@@ -13,20 +17,40 @@ def commit() -> str | None:
 
     None if the package is installed, or there is no git.
     """
+    head = _git("rev-parse", "HEAD")
+    return head and head.strip() + ("+changes" if changes() else "")
+
+
+@cache
+def changes() -> str:
+    """A hash of what differs from that commit; empty if nothing does."""
+    difference = _git("diff", "HEAD", "--", *CODE)
+    return hashlib.sha256(difference.encode()).hexdigest()[:16] if difference else ""
+
+
+def _git(*arguments: str) -> str | None:
+    """What git prints of the checkout that this code runs from; None where there is none."""
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").is_file():
         return None
-    git = ["git", "-C", str(checkout)]
     try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        # What the leaderboard holds is what is being made: it changes no number.
-        code = [".", ":!leaderboard/records", ":!leaderboard/checkpoints", ":!leaderboard/*.md"]
-        status = subprocess.run(
-            [*git, "status", "--porcelain", "-uno", "--", *code], capture_output=True, text=True, check=True
+        done = subprocess.run(
+            ["git", "-C", str(checkout), *arguments],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=True,
         )
     except (OSError, subprocess.CalledProcessError):
         return None
-    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")
+    return done.stdout
+
+
+def usable_cores() -> int:
+    """How many this process may use: on a cluster, fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def machine() -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from m3gn_bench.checkpoint import read_description
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import ConfigError
-from m3gn_bench.provenance import commit
+from m3gn_bench.provenance import changes, commit
 from m3gn_bench.version import __version__
 
 OnProgress = Callable[[int, int], None]
@@ -64,7 +64,7 @@ class Study:
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
         self.folder = folder
         self.results: dict[str, Result] = {}
-        made_by = {"version": __version__, "commit": commit()}
+        made_by = {"version": __version__, "commit": commit(), "changes": changes()}
         head = json.dumps({"settings": settings, **made_by}, sort_keys=True).encode()
         written = folder / "settings.json"
         try:

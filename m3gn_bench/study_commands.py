@@ -32,14 +32,14 @@ def _checkpoints(task: "Task", folders: tuple[Path, ...]) -> "list[Shipped]":
     """The trained models of a task that were asked for, or that ship with the project (preset compact, seed 0)."""
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.errors import CheckpointError
-    from m3gn_bench.leaderboard.record import checkpoint_folder
-    from m3gn_bench.model import build_model, load_preset, model_names
+    from m3gn_bench.leaderboard.record import SHIPPED, checkpoint_folder, shipped_models
+    from m3gn_bench.model import build_model, load_preset
     from m3gn_bench.studies import Shipped
 
     if not folders:
-        names = [n for n in model_names() if checkpoint_folder(task.name, n, "compact").is_dir()]
-        learned = [n for n in names if build_model(load_preset(n, "compact", task), task).is_learned]
-        return [Shipped(n, "compact", checkpoint_folder(task.name, n, "compact")) for n in learned]
+        names = shipped_models(task.name)
+        learned = [n for n in names if build_model(load_preset(n, SHIPPED, task), task).is_learned]
+        return [Shipped(n, SHIPPED, checkpoint_folder(task.name, n, SHIPPED)) for n in learned]
     found = []
     for folder in folders:
         described = read_description(folder)
@@ -160,18 +160,23 @@ def stability(
 ) -> None:
     """Simulators and models at their extremes; exit code 1 if any cell is wrong.
 
-    Without TASK, every task whose scene says what its extremes are. Takes some minutes each; an interrupted run goes on
-    where it stopped.
+    Without TASK, that of the checkpoint, or every task whose scene says what its extremes are. Takes some minutes each;
+    an interrupted run goes on where it stopped.
     """
+    from m3gn_bench.checkpoint import read_description
     from m3gn_bench.generators.extremes import extremes_of, has_extremes
     from m3gn_bench.stability import measure
     from m3gn_bench.tasks import TASKS, get_task
 
     report = Report(as_json)
-    if task_name is None:
-        tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
-    else:
+    if task_name is not None:
         tasks = [get_task(task_name)]
+    elif folders:
+        tasks = [
+            get_task(name) for name in dict.fromkeys(read_description(folder).task for folder in folders)
+        ]
+    else:
+        tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
     chosen = [(task, extremes_of(task.scene), _checkpoints(task, folders)) for task in tasks]
     _alone(data)
     results, studies = [], []
@@ -218,7 +223,7 @@ def stability(
 def render_studies(docs: Path, check: bool, as_json: bool) -> None:
     """Make DOCS/tradeoff.md and its figures from the records in DOCS/studies.  [default: docs]"""
     from m3gn_bench.errors import ConfigError
-    from m3gn_bench.figures import save
+    from m3gn_bench.figures import require_drawable, save
     from m3gn_bench.study_page import draw, read_records, render
 
     tradeoffs, stabilities = read_records(docs / "studies")
@@ -229,6 +234,7 @@ def render_studies(docs: Path, check: bool, as_json: bool) -> None:
     page, content = docs / "tradeoff.md", render(tradeoffs, stabilities)
     current = page.is_file() and page.read_text() == content
     if not check:
+        require_drawable(docs / "studies" / "tradeoff.svg")
         _write(page, content)
         for study in tradeoffs:
             save(draw(study), docs / "studies" / f"tradeoff-{study.task}.svg")

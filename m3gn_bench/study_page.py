@@ -1,6 +1,7 @@
 """The page and the figures of the studies of speed, accuracy and stability, made from their records alone."""
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -245,6 +246,7 @@ def _stability(study: Stability) -> str:
 def draw(study: TradeOff) -> "Figure":
     """Error against time, both logarithmic: settings by knob, models joined over context sizes, the front."""
     from adjustText import adjust_text
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6), layout="constrained")
@@ -259,7 +261,7 @@ def draw(study: TradeOff) -> "Figure":
     )
     front = sorted((w.seconds or 0, w.error or 0) for w in _ways(study) if w.on_front)
     axes.plot(*zip(*front, strict=True), color="0.8", linewidth=6, zorder=1, label="front")
-    colours = iter(f"C{n}" for n in range(10))
+    colours = cycle(colormaps["tab20"](range(20)))
     labels = []
 
     def mark(at: tuple[float, float], label: str) -> None:

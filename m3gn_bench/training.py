@@ -169,7 +169,7 @@ def require_budget(config: RunConfig, is_learned: bool) -> None:
 def usable_device(device: str) -> torch.device:
     """The device. Raises ConfigError if torch cannot use it here."""
     try:
-        torch.empty(0, device=device)
+        torch.zeros(1, device=device).item()  # "meta" has tensors, but no numbers
     except (RuntimeError, AssertionError) as error:  # torch asserts where it was built without the device
         raise ConfigError(f"device {device!r} cannot be used: {error}") from error
     return torch.device(device)

@@ -13,9 +13,11 @@ import pytest
 from conftest import TetraWriter
 
 from m3gn_bench.cli import run
+from m3gn_bench.console import Report, table
 from m3gn_bench.datasets.file import open_file, read_metadata
 from m3gn_bench.datasets.schema import Metadata
 from m3gn_bench.datasets.trajectory import Trajectory
+from m3gn_bench.datasets.writer import reserved
 
 TASK = "sheet_deformation"
 
@@ -97,7 +99,22 @@ EVALUATE = ["evaluate", "--task", TASK, "--model", "m3gn", "--tier", "smoke"]
         ([*EVALUATE, "--task", "bending"], ["task 'bending'", "known: deformable_block, falling_teddy,"]),
         ([*EVALUATE, "--model", "gpt"], ["model 'gpt'", "known: ", "m3gn, ", "mgn"]),
         ([*EVALUATE, "--split", "dev"], ["split 'dev'", "known: test, train, validation"]),
-        ([*EVALUATE, "--preset", "big"], ["preset big", "--checkpoint"]),
+        ([*EVALUATE, "--preset", "big"], ["preset 'big'", "known: compact, paper, smoke"]),
+        (
+            [*EVALUATE, "--seed", "9"],
+            ["seed 9", "--checkpoint", "seed 0, there are ", "mgn_material"],
+        ),
+        ([*EVALUATE, "--contexts", "2,51"], ["context size 51 is out of range"]),
+        (
+            ["profile", "--task", TASK, "--model", "mgn", "--preset", "big"],
+            ["preset 'big'", "known: compact, paper"],
+        ),
+        (
+            ["profile", "--task", TASK, "--model", "mgn", "--context", "51"],
+            ["context size 51 is out of range"],
+        ),
+        (["leaderboard", "render", "--home", "typo"], ["'typo' does not exist"]),
+        (["leaderboard", "submit", "some.json", "--home", "typo"], ["there is no leaderboard typo"]),
         (
             ["leaderboard", "show", "--task", "bending"],
             ["task 'bending'", "known: deformable_block, falling_teddy,"],
@@ -327,6 +344,7 @@ def test_evaluate_refuses(
     [
         (["--threads", "0"], ["threads"]),
         (["--device", "abacus"], ["device", "abacus"]),
+        (["--device", "meta"], ["device 'meta' cannot be used"]),
         (["--device", "cuda:99"], ["device", "cuda:99"]),
         (["--seed", "-1"], ["seed"]),
     ],
@@ -344,6 +362,13 @@ def test_training_does_not_overwrite_another_run(command: Command, trained: Path
     outcome = command(*TRAIN[:-1], trained, "--steps", 3, "--data", smoke_file.parent)
     assert_one_line(outcome, "another finished run", "use another folder")
     assert (trained / "checkpoint.json").read_bytes() == before
+
+
+def test_a_folder_is_trained_in_once_at_a_time(command: Command, smoke_file: Path, tmp_path: Path) -> None:
+    with reserved(tmp_path / "run", "trains", tmp_path / "run"):
+        outcome = command(*TRAIN[:-1], tmp_path / "run", "--steps", 2, "--data", smoke_file.parent)
+    assert_one_line(outcome, "another process trains in", "wait until it has finished")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_damaged_data_is_not_trained_on(command: Command, smoke_file: Path, tmp_path: Path) -> None:
@@ -375,6 +400,20 @@ SCENES = {  # training trajectories of the paper tier
     "falling_teddy": 700,
     "mixed_objects": 1800,
 }
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_no_table_is_cut_by_a_narrow_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    numbers = [f"{number}.2345e-06" for number in range(30)]
+    Report(as_json=False).finish({}, table("errors [mm]", ["model", *numbers], [["m3gn", *numbers]]))
+    title, *rows = capsys.readouterr().out.splitlines()
+    assert "errors [mm]" in title
+    for number in numbers:
+        assert sum(number in row for row in rows) == 2
 
 
 def test_list_as_json(command: Command) -> None:

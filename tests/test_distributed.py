@@ -88,7 +88,7 @@ def test_draws_of_shares_are_those_of_the_batch() -> None:
 
 
 def test_too_many_processes_for_a_batch() -> None:
-    with pytest.raises(ConfigError, match=r"batch of 5 .* 6 processes; .*training.batch_size to 6"):
+    with pytest.raises(ConfigError, match=r"batch of 5 .* 6 processes; .*6 or more .*training.batch_size"):
         Group(0, 6).share(batch_of("sheet_deformation"))
 
 

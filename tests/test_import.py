@@ -79,7 +79,7 @@ def assert_refused(outcome: Outcome, *parts: str) -> None:
 
 def seed(word: str, index: int) -> int:
     """Of a trajectory."""
-    return 10 * len(word) + index
+    return 10 * sum(word.encode()) + index
 
 
 def lattice(nodes: int, side: float, corner: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

@@ -688,17 +688,22 @@ def test_show_lists_what_is_on_record(
     }
 
 
-@pytest.mark.parametrize(("model", "is_there"), [("mgn", True), ("stand_still", False)])
+@pytest.mark.parametrize(
+    ("model", "version", "is_there"),
+    [("mgn", None, True), ("mgn", "of old", False), ("stand_still", None, False)],
+)
 def test_evaluation_repeats_what_is_on_record(
     board: Path,
     smoke_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     model: str,
+    version: str | None,
     is_there: bool,
 ) -> None:
-    """And shows it beside what it finds, where the board has the model."""
-    known = [record for record in read_records(board) if record.model == "mgn"]
+    """And shows it beside what it finds, where the board has the model on these trajectories."""
+    (recorded,) = (record for record in read_records(board) if record.model == "mgn")
+    known = [recorded.model_copy(update={"dataset_version": version or recorded.dataset_version})]
     monkeypatch.setattr(record, "read_records", lambda: known)
     folder = checkpoint_folder("sheet_deformation", model, "smoke", home=board)
     evaluate = ["evaluate", "--model", model, "--checkpoint", str(folder), "--threads", "1", "--json"]

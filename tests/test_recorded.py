@@ -1,6 +1,7 @@
 """A record tells the same dataset from another one, bit by bit or up to rounding."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,21 @@ def test_card_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.Monk
     assert all(f"| content hash, {tier} | `{digest}` |" in rows for tier, digest in hashes.items())
     with open_file(quick_file) as file:
         assert hashes == tier_hashes(file)
+
+
+def test_a_card_is_not_written_of_a_file_that_is_not_recorded(
+    quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(quick_file, tmp_path)
+    known = read_record("sheet_deformation", tmp_path)
+    larger = known.model_copy(update={"hashes": {**known.hashes, "paper": "0" * 64}})
+    (tmp_path / "sheet_deformation.json").write_text(larger.model_dump_json())
+    monkeypatch.setattr(recorded, "FOLDER", tmp_path)
+    monkeypatch.setattr(card, "CARDS", tmp_path)
+    shutil.copy(CARDS / "sheet_deformation.md", tmp_path)
+    outcome = CliRunner().invoke(cli, ["card", str(quick_file)])
+    assert "has no tier paper, which is recorded" in str(outcome.exception)
+    assert (tmp_path / "sheet_deformation.md").read_text() == (CARDS / "sheet_deformation.md").read_text()
 
 
 def parts(text: str) -> tuple[str, str, str]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from m3gn_bench import stability, study_commands, tradeoff
+from m3gn_bench import stability, studies, study_commands, tradeoff
 from m3gn_bench.checkpoint import load_checkpoint, read_description
 from m3gn_bench.cli import cli
 from m3gn_bench.data import case_from
@@ -28,6 +29,7 @@ from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.generators.workers import run_jobs
 from m3gn_bench.leaderboard.record import checkpoint_folder
+from m3gn_bench.model import model_names
 from m3gn_bench.stability import MODEL_CELLS, REASONED
 from m3gn_bench.studies import Cell, Result, Shipped, Study, distance
 from m3gn_bench.study_page import draw, is_converged, read_records, render
@@ -98,6 +100,15 @@ def test_results_of_other_settings_are_dropped(tmp_path: Path) -> None:
     calls: list[str] = []
     for settings in ({"a": 1}, {"a": 2}):
         Study(tmp_path, settings).measure([counted(calls, "one")], ignore)
+    assert calls == ["one", "one"]
+
+
+def test_results_of_other_code_are_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of code that no commit holds."""
+    calls: list[str] = []
+    for difference in ("an edit", "another"):
+        monkeypatch.setattr(studies, "changes", lambda difference=difference: difference)
+        Study(tmp_path, {}).measure([counted(calls, "one")], ignore)
     assert calls == ["one", "one"]
 
 
@@ -264,7 +275,7 @@ def test_an_interrupted_tradeoff_still_times_in_rounds(
 
 
 @pytest.mark.usefixtures("small", "few_runs")
-def test_commands_measure_record_and_render(tmp_path: Path) -> None:
+def test_commands_measure_record_and_render(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both studies and the page; then the page is up to date, until a record changes."""
     docs = tmp_path / "docs"
 
@@ -300,6 +311,22 @@ def test_commands_measure_record_and_render(tmp_path: Path) -> None:
     assert run("render-studies", str(docs), "--check")[0] == 1
     with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
         save(draw(result), tmp_path / "figure.xyz")
+
+    # A figure has room for all models that there are.
+    (one, *_) = result.models
+    many = tuple(one.model_copy(update={"model": name}) for name in model_names())
+    legend = draw(result.model_copy(update={"models": many})).legends[0]
+    assert {f"{name}, by context" for name in model_names()} <= {
+        text.get_text() for text in legend.get_texts()
+    }
+
+    # Without the libraries for figures, nothing is written by half.
+    (docs / "tradeoff.md").write_text("as it was")
+    monkeypatch.setitem(sys.modules, "adjustText", None)
+    assert "pip install 'm3gn-bench[plot]'" in str(
+        CliRunner().invoke(cli, ["render-studies", str(docs)]).exception
+    )
+    assert (docs / "tradeoff.md").read_text() == "as it was"
 
 
 def test_what_is_timed_in_part_is_extrapolated_from_the_least_times() -> None:
@@ -445,6 +472,7 @@ def test_a_damaged_record_is_named(tmp_path: Path) -> None:
             ["tradeoff", "deformable_block", "--checkpoint", str(M3GN.folder)],
             "was trained on sheet_deformation",
         ),
+        (["stability", "--checkpoint", "nowhere"], "no checkpoint in nowhere"),
         (["render-studies", "nowhere"], "no records in nowhere"),
     ],
 )

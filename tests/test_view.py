@@ -552,7 +552,7 @@ def test_every_scene_has_a_look() -> None:
         ("block", ["-o", "x.png", "--context", "2"], "--task and --context are for models"),
         ("block", ["-o", "x.png", "--model", "m4gn"], "unknown model 'm4gn'; known: "),
         ("block", ["-o", "x.png", "--model", "mgn", "--task", "x"], "unknown task 'x'; known: deformable_block"),
-        ("tetra", ["-o", "x.png", "--model", "mgn"], "there is no task of scene tetra"),
+        ("tetra", ["-o", "x.png", "--model", "mgn"], "unknown task 'tetra_task'; known: deformable_block"),
         ("block", ["-o", "x.png", "--checkpoint", "none"], "no checkpoint in none"),
         ("block", [], "Missing option '--output'"),
         ("nan", ["-o", "x.png"], "trajectory test_00000 cannot be drawn; 'm3gn-bench validate'"),
