@@ -27,15 +27,15 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, NonNegativeInt, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from m3gn_bench.checkpoint import copy_checkpoint
 from m3gn_bench.data import Materials, load_cases
 from m3gn_bench.datasets.errors import BenchError, first_problem
 from m3gn_bench.datasets.file import content_hash, open_file
-from m3gn_bench.datasets.schema import TIERS, Record, Split
+from m3gn_bench.datasets.schema import LARGEST_SEED, TIERS, Record, Split
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.pace import Pace, read_pace
 from m3gn_bench.leaderboard.record import (
@@ -62,7 +62,7 @@ class Grid(Record):
 
     tasks: tuple[str, ...] = Field(min_length=1)
     models: tuple[str, ...] = Field(min_length=1)
-    seeds: tuple[NonNegativeInt, ...] = Field(default=(0,), min_length=1)
+    seeds: tuple[Annotated[int, Field(ge=0, le=LARGEST_SEED)], ...] = Field(default=(0,), min_length=1)
     shipped_seeds: tuple[int, ...] = ()
     preset: str = "compact"
     minutes: float | None = None

@@ -48,6 +48,7 @@ EXECUTOR = click.option(
     help="What runs them: this machine, the workers of a dask scheduler (extra `dask`), or SLURM (extra `slurm`), "
     "where --workers counts jobs at a time. On a cluster all folders must be on a file system that all workers see.",
 )
+SEED = click.IntRange(0, 2**63 - 1)  # as datasets.schema.LARGEST_SEED, which takes long to import
 DEVICE = click.option("--device", default="cpu", show_default=True, help="A torch device.")
 OnProgress = Callable[[int, int], None]
 WIDE = 10_000  # columns

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from m3gn_bench.console import DATA, EXECUTOR, JSON, WORKERS, Report
+from m3gn_bench.console import DATA, EXECUTOR, JSON, SEED, WORKERS, Report
 
 if TYPE_CHECKING:
     from m3gn_bench.generators.scene import Scene
@@ -42,9 +42,7 @@ if TYPE_CHECKING:
 )
 @click.option("--plane", default=None, help="Deformable block: stress (default) or strain.")
 @click.option("--split", "splits", multiple=True, help="Only this split (may be given several times).")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=None, help="Of the dataset.  [default: the leaderboard's]"
-)
+@click.option("--seed", type=SEED, default=None, help="Of the dataset.  [default: the leaderboard's]")
 @WORKERS
 @EXECUTOR
 @DATA

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from m3gn_bench.console import DATA, DEVICE, JSON, WORKERS, Report, table
+from m3gn_bench.console import DATA, DEVICE, JSON, SEED, WORKERS, Report, table
 from m3gn_bench.provenance import usable_cores
 
 if TYPE_CHECKING:
@@ -34,9 +34,7 @@ DATASET = click.option(
 @click.option("--task", required=True, help="What to train on.")
 @click.option("--model", required=True, help="Which model.")
 @click.option("--preset", default="compact", show_default=True, help="smoke, compact or paper.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and sampling."
-)
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Of weights and sampling.")
 @click.option("--minutes", type=float, default=None, help="Budget: CPU minutes of training steps.")
 @click.option("--steps", type=int, default=None, help="Budget: optimiser steps.")
 @click.option("--tier", default="paper", show_default=True, help="Which data.")
@@ -161,9 +159,7 @@ def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
 )
 @click.option("--tier", default="quick", show_default=True, help="Which test trajectories.")
 @click.option("--preset", default="compact", show_default=True, help="Which shipped checkpoint.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which shipped checkpoint."
-)
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Which shipped checkpoint.")
 @click.option(
     "--checkpoint",
     type=click.Path(path_type=Path, file_okay=False),

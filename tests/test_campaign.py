@@ -210,6 +210,10 @@ def _alive(session: int) -> bool:
         (HEAD + GRID + 'variant = "a"\nshipped_seeds = [0]\n', "table 1: checkpoints of a variant"),
         (HEAD + GRID + "seeds = [-1]\n", r"runs.0.seeds.0: .*greater than or equal to 0"),
         (HEAD + GRID + "shipped_seeds = [7]\n", r"runs.0: .*shipped_seeds: 7 is none of seeds"),
+        (
+            HEAD + GRID + "seeds = [9223372036854775808]\n",
+            r"runs.0.seeds.0: .*less than or equal to 9223372036",
+        ),
         (HEAD + GRID + 'settings = { "training.learning_rate" = 1 }\n', "name what differs by a variant"),
         (HEAD + GRID + "materials = { youngs_modulus = [10] }\n", "name what differs by a variant"),
     ],
