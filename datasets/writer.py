@@ -78,9 +78,9 @@ def reserved(folder: Path, doing: str, place: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # Whoever had it may have deleted it in the end: then this is the lock of nothing.
-            if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+            if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                 raise busy
-        except BlockingIOError:
+        except (BlockingIOError, FileNotFoundError):
             raise busy from None
         except OSError as error:
             raise DatasetError(

@@ -214,9 +214,8 @@ def generate(
         with open_file(path) as file:
             made = read_metadata(file)
             seconds = [float(file["trajectories"][key]["diagnostics"].attrs["cpu_seconds"]) for key in wanted]
-        if set(shard_folder.glob("*.h5")) <= set(
-            shards.values()
-        ):  # else a larger tier was interrupted: it may go on
+        others = set(shard_folder.glob("*.h5")) - set(shards.values())
+        if not others:  # else a larger tier was interrupted, and may go on
             shutil.rmtree(shard_folder, ignore_errors=True)  # somebody else may just look for the lock
     return GenerationReport(
         path, made.content_hash, len(wanted), list(made.rejections), float(np.mean(seconds)), len(todo)

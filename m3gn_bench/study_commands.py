@@ -172,9 +172,7 @@ def stability(
     if task_name is not None:
         tasks = [get_task(task_name)]
     elif folders:
-        tasks = [
-            get_task(name) for name in dict.fromkeys(read_description(folder).task for folder in folders)
-        ]
+        tasks = [get_task(read_description(folders[0]).task)]
     else:
         tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
     chosen = [(task, extremes_of(task.scene), _checkpoints(task, folders)) for task in tasks]
