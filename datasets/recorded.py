@@ -2,11 +2,14 @@
 
 The same code on the same kind of processor gives the same bits. Another processor may round differently in the
 last digit (other vector instructions, fused multiply-add), which changes the content hash but nothing that
-matters; for that case a few coordinates of every quick-tier trajectory are kept and compared with a tolerance.
+matters; for that case a sketch of every trajectory is kept: a few numbers to which all of its numbers contribute.
 """
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
@@ -18,20 +21,33 @@ from m3gn_bench.datasets.file import (
     stored_hashes,
     tier_hashes,
 )
-from m3gn_bench.datasets.schema import SMALL_TIERS, Record, in_tier
-from m3gn_bench.datasets.trajectory import FREE, Trajectory
+from m3gn_bench.datasets.schema import Record
+from m3gn_bench.datasets.trajectory import Trajectory, hash_arrays
 from m3gn_bench.datasets.writer import write_bytes_atomically
 
 FOLDER = Path(__file__).parent / "recorded"
-PROBED_FRAMES = 3
-PROBED_NODES = 4
+PROJECTIONS = 3  # of an array; with one alone, a difference may cancel
+DIGITS = 7
 # In scaled units, as are all errors on the leaderboard. Rounding alone stays far below: 1e-12 m added to the start
 # of a falling body, the most sensitive of the scenes, moves it by less than 1e-6 (`validation/test_falling.py`).
 TOLERANCE = 1e-4
 
 
+class Sketch(Record):
+    """What a trajectory is known by where its bits may differ.
+
+    Attributes:
+        discrete: a hash of what is not rounded: names and shapes of all arrays, cells, node types, edges, tags.
+        numbers: of every other array, in the order of the names, the material's parameters last: its random
+            projections, or itself if it is not larger than they are. Physical units.
+    """
+
+    discrete: str
+    numbers: tuple[float, ...]
+
+
 class RecordedDataset(Record):
-    """Hashes of a scene's tiers, and probes of the quick tier: coordinates by trajectory."""
+    """Hashes of a scene's tiers, and a sketch of every trajectory."""
 
     scene: str
     dataset_version: str
@@ -39,7 +55,7 @@ class RecordedDataset(Record):
     simulator_versions: dict[str, str]
     machine: str
     hashes: dict[str, str]
-    probes: dict[str, tuple[float, ...]]
+    sketches: dict[str, Sketch]
 
     def require(self, version: str, tier: str) -> None:
         """Raises DatasetError if this tier of this version of the dataset is not recorded."""
@@ -51,14 +67,15 @@ class RecordedDataset(Record):
 
 
 class Reproduction(Record):
-    """How a dataset file compares with the record: bit by bit, or else by probes of the quick tier's trajectories."""
+    """How a dataset file compares with the record: bit by bit, or else by the sketches of its trajectories."""
 
     scene: str
     tier: str
     file: str
     identical: bool
     trajectories: int
-    largest_difference: float  # scaled units; 0 if identical
+    largest_difference: float  # as of `differences`; 0 if identical, infinite if what is not rounded differs
+    where: str  # the trajectory, and what of it, that differs most; empty if identical
     tolerance: float = TOLERANCE
 
     @property
@@ -67,13 +84,52 @@ class Reproduction(Record):
         return self.identical or (self.trajectories > 0 and self.largest_difference <= self.tolerance)
 
 
-def probe(trajectory: Trajectory) -> tuple[float, ...]:
-    """Coordinates of a few free nodes in a few frames, the last one among them, in physical units."""
-    frames = len(trajectory.positions)
-    free = np.flatnonzero(trajectory.mesh.node_type == FREE)
-    chosen_frames = np.linspace(0, frames - 1, PROBED_FRAMES + 1, dtype=int)[1:]
-    chosen_nodes = free[np.linspace(0, len(free) - 1, PROBED_NODES + 2, dtype=int)[1:-1]]
-    return tuple(trajectory.positions[np.ix_(chosen_frames, chosen_nodes)].ravel().tolist())
+def sketch(trajectory: Trajectory) -> Sketch:
+    """A trajectory's sketch."""
+    rounded = _rounded_arrays(trajectory)
+    digest = hash_arrays({k: v for k, v in trajectory.arrays().items() if k not in rounded})
+    shapes = {name: list(array.shape) for name, array in rounded.items()}
+    digest.update(json.dumps([shapes, trajectory.tags], sort_keys=True).encode())
+    numbers = [number for array in rounded.values() for number in _project(array)]
+    return Sketch(
+        discrete=digest.hexdigest()[:16], numbers=tuple(float(f"{number:.{DIGITS}g}") for number in numbers)
+    )
+
+
+def differences(trajectory: Trajectory, recorded: Sketch, scale_length: float) -> dict[str, float]:
+    """How far each array of a trajectory is from the recorded one, by name.
+
+    The root mean square of the differences of the projections, which estimates that of the differences of the numbers
+    themselves (Alon, Matias and Szegedy 1996): lengths over `scale_length`, anything else over its own root mean
+    square. Infinite if what is not rounded differs.
+    """
+    if sketch(trajectory).discrete != recorded.discrete:
+        return {"what is not rounded": np.inf}
+    found, position = {}, 0
+    for name, array in _rounded_arrays(trajectory).items():
+        numbers = _project(array)
+        expected = recorded.numbers[position : position + len(numbers)]
+        position += len(numbers)
+        is_length = name.endswith("positions")
+        unit = scale_length if is_length else float(np.sqrt(np.mean(np.square(array)))) or 1.0
+        found[name] = float(np.sqrt(np.mean(np.square(np.subtract(numbers, expected))))) / unit
+    return found
+
+
+def _rounded_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Everything that a processor may round in its own way, in double precision."""
+    arrays = {name: a for name, a in sorted(trajectory.arrays().items()) if a.dtype.kind == "f"}
+    material = {f"material/{name}": np.array(value) for name, value in sorted(trajectory.material.items())}
+    return {name: array.astype(np.float64) for name, array in (arrays | material).items()}
+
+
+def _project(array: np.ndarray) -> np.ndarray:
+    """The array against random signs, divided by the root of its size: of the order of its root mean square."""
+    if array.size <= PROJECTIONS:
+        return array.ravel()
+    bits = np.random.PCG64(0).random_raw(PROJECTIONS * array.size // 64 + 1).astype("<u8")
+    signs = 2.0 * np.unpackbits(bits.view(np.uint8), count=PROJECTIONS * array.size) - 1
+    return signs.reshape(PROJECTIONS, -1) @ array.ravel() / np.sqrt(array.size)
 
 
 def record(path: Path, folder: Path | None = None) -> Path:
@@ -95,7 +151,6 @@ def record(path: Path, folder: Path | None = None) -> Path:
                     f"{path} has no tier {', '.join(sorted(lost))}, which is recorded of {metadata.scene}; "
                     "record a file that has"
                 )
-        quick = sorted(key for key in stored_hashes(file) if in_tier(key, SMALL_TIERS["quick"]))
         recorded = RecordedDataset(
             scene=metadata.scene,
             dataset_version=metadata.dataset_version,
@@ -103,9 +158,11 @@ def record(path: Path, folder: Path | None = None) -> Path:
             simulator_versions=metadata.simulator_versions,
             machine=metadata.machine,
             hashes=hashes,
-            probes={key: probe(read_trajectory(file, key)) for key in quick},
+            sketches={key: sketch(read_trajectory(file, key)) for key in sorted(stored_hashes(file))},
         )
-    write_bytes_atomically(destination, (recorded.model_dump_json(indent=1) + "\n").encode())
+    # A line for every trajectory.
+    text = recorded.model_dump_json().replace(']},"', ']},\n"') + "\n"
+    write_bytes_atomically(destination, text.encode())
     return destination
 
 
@@ -145,17 +202,25 @@ def compare(path: Path, folder: Path | None = None) -> Reproduction:
         recorded = read_record(metadata.scene, folder)
         recorded.require(metadata.dataset_version, metadata.tier)
         identical = content_hash(file, metadata.tier) == recorded.hashes[metadata.tier]
-        keys = [key for key in stored_hashes(file) if key in recorded.probes]
-        largest = 0.0
-        if not identical:
-            for key in keys:
-                difference = np.subtract(probe(read_trajectory(file, key)), recorded.probes[key])
-                largest = float(np.max([largest, np.abs(difference).max() / metadata.scale_length]))
+        keys = [key for key in stored_hashes(file) if key in recorded.sketches]
+        found = {} if identical else dict(_all_differences(file, keys, recorded, metadata.scale_length))
+    # NaN is the worst that there can be.
+    where = max(found, key=lambda name: np.nan_to_num(found[name], nan=np.inf), default="")
     return Reproduction(
         scene=metadata.scene,
         tier=metadata.tier,
         file=str(path),
         identical=identical,
         trajectories=len(keys),
-        largest_difference=largest,
+        largest_difference=found.get(where, 0.0),
+        where=where,
     )
+
+
+def _all_differences(
+    file: h5py.File, keys: list[str], recorded: RecordedDataset, scale_length: float
+) -> Iterator[tuple[str, float]]:
+    """The differences of all trajectories by trajectory and array."""
+    for key in keys:
+        of_key = differences(read_trajectory(file, key), recorded.sketches[key], scale_length)
+        yield from ((f"{key}, {name}", difference) for name, difference in of_key.items())

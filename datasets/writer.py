@@ -13,6 +13,7 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import h5py
 import numpy as np
@@ -53,6 +54,15 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
     """Write a whole file or nothing. Raises DatasetError as `atomic_path` does."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def require_writable(folder: Path) -> None:
+    """For work whose result goes there in the end. Raises DatasetError if nothing can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise DatasetError(f"cannot write to {folder}: {error.strerror or error}") from error
 
 
 @contextmanager

@@ -297,7 +297,7 @@ def _checkpoints(
 @click.argument("file", type=click.Path(path_type=Path))
 @JSON
 def card(file: Path, as_json: bool) -> None:
-    """Write the numbers of a dataset FILE into its scene's card, and record its hashes."""
+    """Write the numbers of a dataset FILE into its scene's card, and record it."""
     from m3gn_bench.datasets.card import CARDS, fill, numbers
     from m3gn_bench.datasets.file import open_file, read_metadata
     from m3gn_bench.datasets.recorded import record, require_own
@@ -355,8 +355,8 @@ def reproduce(scene_name: str | None, tier: str, workers: int, as_json: bool) ->
     agreement = (
         "bit-identical to the record"
         if outcome.identical
-        else f"not bit-identical; largest difference {outcome.largest_difference:.1e} in scaled units in "
-        f"{outcome.trajectories} trajectories (allowed {outcome.tolerance:g}, for processors that round differently)"
+        else f"not bit-identical; largest difference {outcome.largest_difference:.1e} in scaled units, at "
+        f"{outcome.where} (allowed {outcome.tolerance:g}, for processors that round differently)"
     )
     report.finish(
         outcome.model_dump(mode="json") | {"ok": outcome.ok, "content_hash": made.content_hash},

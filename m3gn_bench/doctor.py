@@ -13,7 +13,7 @@ import numpy as np
 
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.plugins import DISTRIBUTION, Kind, package_of, plugins
-from m3gn_bench.datasets.recorded import TOLERANCE, probe, read_record
+from m3gn_bench.datasets.recorded import TOLERANCE, differences, read_record
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.version import __version__
 
@@ -219,12 +219,12 @@ def simulations() -> Iterator[Finding]:
     for name in OWN_SCENES:
         scene, start = get_scene(name), time.perf_counter()
         try:
-            expected = read_record(name).probes["test_00000"]
+            expected = read_record(name).sketches["test_00000"]
             trajectory, _ = simulate_one(scene, "test", 0)
         except BenchError as error:
             yield Finding(part="self-test", name=name, state="wrong", detail=str(error))
             continue
-        difference = float(np.abs(np.subtract(probe(trajectory), expected)).max() / scene.scale_length)
+        difference = float(np.max([*differences(trajectory, expected, scene.scale_length).values()]))
         right = difference <= TOLERANCE
         detail = f"simulated in {time.perf_counter() - start:.1f} s; {difference:.1e} from the record (scaled units)"
         yield Finding(part="self-test", name=name, state="fine" if right else "wrong", detail=detail)

@@ -95,6 +95,8 @@ def train(
     # Whatever can be refused is refused before data are simulated.
     require_budget(config, build_model(config, spec).is_learned)
     group.require_shares(config.training.batch_size)
+    if group.leads:
+        click.get_current_context().with_resource(reserved(out, "trains", out))
     curves = tensorboard_observer(out) if tensorboard and group.leads else None
     path = dataset
     if path is None:
@@ -105,8 +107,6 @@ def train(
     with open_file(path) as file:
         dataset_hash = content_hash(file, tier, ("train", "validation"))
     training, validation = (load_cases(path, spec, split, tier) for split in ("train", "validation"))
-    if group.leads:
-        click.get_current_context().with_resource(reserved(out, "trains", out))
     with report.progress(f"training {model}") as on_progress:
 
         def observe(progress: Progress) -> None:
@@ -219,6 +219,7 @@ def evaluate(
     from m3gn_bench.data import require_context
     from m3gn_bench.datasets.file import open_file, read_splits
     from m3gn_bench.datasets.schema import as_split
+    from m3gn_bench.datasets.writer import require_writable
     from m3gn_bench.errors import CheckpointError, ConfigError
     from m3gn_bench.leaderboard.record import (
         SHIPPED,
@@ -292,6 +293,7 @@ def evaluate(
         board = [] if replace else read_records(record_home)
         for folder in folders.values():
             _require_recordable(folder, board, track, variant)
+        require_writable(record_home)
     recorded = read_records()
     rows: list[dict[str, Any]] = []
     for name, folder in folders.items():

@@ -372,6 +372,18 @@ def test_a_folder_is_trained_in_once_at_a_time(command: Command, smoke_file: Pat
     assert list(tmp_path.iterdir()) == []
 
 
+def test_where_nothing_can_be_written_nothing_is_simulated(
+    command: Command, trained: Path, tmp_path: Path
+) -> None:
+    """Refused before the work, not after it."""
+    (tmp_path / "file").touch()
+    below, data = tmp_path / "file" / "folder", ["--data", tmp_path / "data"]
+    evaluate = [*EVALUATE, "--checkpoint", trained, "--record", below, "--variant", "short"]
+    for arguments in ([*TRAIN[:-1], below, "--steps", 2], evaluate):
+        assert_one_line(command(*arguments, *data), "cannot write to", "folder", "Not a directory")
+        assert not (tmp_path / "data").exists()
+
+
 def test_damaged_data_is_not_trained_on(command: Command, smoke_file: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     data.mkdir()

@@ -9,14 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.spatial import cKDTree
 
 from m3gn_bench.cli import cli
 from m3gn_bench.datasets import card, recorded
 from m3gn_bench.datasets.card import CARDS, Moments
 from m3gn_bench.datasets.errors import DatasetError
 from m3gn_bench.datasets.file import open_file, read_metadata, read_trajectory, stored_hashes, tier_hashes
-from m3gn_bench.datasets.recorded import compare, probe, read_record, record
+from m3gn_bench.datasets.recorded import (
+    PROJECTIONS,
+    TOLERANCE,
+    compare,
+    differences,
+    read_record,
+    record,
+    sketch,
+)
 from m3gn_bench.datasets.schema import SMALL_TIERS, trajectory_key
+from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import merge_shards, write_shard
 from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
@@ -70,8 +80,10 @@ def test_another_file_is_measured(
     record(quick_file, tmp_path)
     outcome = compare(altered(smoke_file, tmp_path, change), tmp_path)
     assert not outcome.identical
-    assert outcome.largest_difference == pytest.approx(change, rel=0.2, nan_ok=True)
+    assert outcome.where.endswith(", positions")
     assert outcome.ok == ok
+    if np.isfinite(change):  # three projections estimate it
+        assert change / 3 < outcome.largest_difference < 3 * change
 
 
 @pytest.mark.parametrize("change", [{"fidelity": "fast"}, {"variant": {"solver": "other"}}, {"seed": 1}])
@@ -100,14 +112,69 @@ def test_less_than_what_is_recorded_does_not_replace_it(quick_file: Path, tmp_pa
     record(quick_file, tmp_path)  # of a newer version less is something
 
 
-def test_probe_covers_the_last_frame(smoke_file: Path) -> None:
+def with_changed(array: np.ndarray, place: Any, change: float) -> np.ndarray:
+    changed = array.copy()
+    changed[place] += change
+    return changed
+
+
+def tampered(trajectory: Trajectory, part: str) -> Trajectory:
+    """The trajectory with one part of it wrong."""
+    mesh, scale = trajectory.mesh, np.ptp(trajectory.positions)
+    match part:
+        case "positions":  # one node in one frame
+            return replace(trajectory, positions=with_changed(trajectory.positions, (30, 100), 0.1 * scale))
+        case "mesh/rest_positions":
+            moved = with_changed(mesh.rest_positions, 100, 0.01 * scale)
+            return replace(trajectory, mesh=replace(mesh, rest_positions=moved))
+        case "loads/nodal_forces":
+            wrong = trajectory.loads["nodal_forces"][::-1]
+            return replace(trajectory, loads=trajectory.loads | {"nodal_forces": wrong})
+        case "material/youngs_modulus":
+            return replace(
+                trajectory, material={"youngs_modulus": trajectory.material["youngs_modulus"] * 1.001}
+            )
+        case "cells":
+            return replace(trajectory, mesh=replace(mesh, cells=mesh.cells[::-1]))
+        case "node_type":
+            return replace(trajectory, mesh=replace(mesh, node_type=1 - mesh.node_type))
+        case "tags":
+            return replace(trajectory, tags={"object": "teddy"})
+        case _:
+            return replace(trajectory, collider_positions=trajectory.positions[:, :1])
+
+
+@pytest.mark.parametrize(
+    "part", ["positions", "mesh/rest_positions", "loads/nodal_forces", "material/youngs_modulus"]
+)
+def test_a_sketch_has_all_that_is_rounded(smoke_file: Path, part: str) -> None:
+    """What differs is named; nothing else does."""
+    with open_file(smoke_file) as file:
+        trajectory, scale_length = read_trajectory(file, "test_00000"), read_metadata(file).scale_length
+    found = differences(tampered(trajectory, part), sketch(trajectory), scale_length)
+    assert found[part] > TOLERANCE
+    assert all(difference < 1e-6 for name, difference in found.items() if name != part)
+
+
+@pytest.mark.parametrize("part", ["cells", "node_type", "tags", "collider"])
+def test_a_sketch_has_all_that_is_not_rounded(smoke_file: Path, part: str) -> None:
     with open_file(smoke_file) as file:
         trajectory = read_trajectory(file, "test_00000")
-    before = probe(trajectory)
-    changed = trajectory.positions.copy()
-    changed[-1] += 1
-    assert len(before) == 3 * 4 * 3
-    assert probe(replace(trajectory, positions=changed)) != before
+    assert differences(tampered(trajectory, part), sketch(trajectory), 1.0) == {"what is not rounded": np.inf}
+
+
+def test_a_difference_is_estimated_without_bias(smoke_file: Path) -> None:
+    """Over many random errors the mean square of the sketch's differences is that of the numbers."""
+    with open_file(smoke_file) as file:
+        trajectory = read_trajectory(file, "test_00000")
+    known, rng, size = sketch(trajectory), np.random.default_rng(0), 1.0
+    estimates = []
+    for _ in range(200):
+        error = size * rng.normal(size=trajectory.positions.shape).astype(np.float32)
+        noisy = replace(trajectory, positions=trajectory.positions + error)
+        estimates.append(differences(noisy, known, scale_length=1.0)["positions"])
+    # The square is chi-squared with three degrees of freedom over three: its mean of 200 has a deviation of 6 %.
+    assert np.mean(np.square(estimates)) == pytest.approx(size**2, rel=0.2)
 
 
 @pytest.mark.parametrize("change", [{"dataset_version": "9.9"}, {"scene": "unheard_of"}])
@@ -135,17 +202,21 @@ def test_every_scene_is_recorded_with_its_paper_tier(scene: str) -> None:
     found = read_record(scene)
     assert found.dataset_version == get_scene(scene).dataset_version
     assert set(found.hashes) == {"smoke", "quick", "paper"}
-    assert len(found.probes) == 96
+    assert len(found.sketches) == sum(get_scene(scene).paper_sizes.values())
     shown = (CARDS / f"{scene}.md").read_text()
     assert all(digest in shown for digest in found.hashes.values())
 
 
 @pytest.mark.parametrize("scene", scene_names())
-def test_recorded_probes_tell_trajectories_apart(scene: str) -> None:
-    """Nodes that never move, such as clamped ones, would compare equal whatever was simulated."""
-    probes = np.array(list(read_record(scene).probes.values()))
-    moving = (np.ptp(probes, axis=0) > 1e-3).mean()
-    assert moving > 0.6, f"{1 - moving:.0%} of the probed coordinates are the same in all trajectories"
+def test_recorded_sketches_tell_trajectories_apart(scene: str) -> None:
+    """By the positions alone, which come last before the material. Chance makes a few nearly the same: five pairs of
+    Tissue Manipulation have one patch, one material, and directions that differ by less than 0.07 degrees.
+    """
+    material = len(get_scene(scene).material_units)
+    sketches = read_record(scene).sketches.values()
+    positions = np.array([known.numbers[-material - PROJECTIONS : -material] for known in sketches])
+    nearest = cKDTree(positions).query(positions, k=2)[0][:, 1] / np.sqrt(PROJECTIONS)
+    assert (nearest < TOLERANCE * get_scene(scene).scale_length).mean() < 0.02
 
 
 def test_reproduce_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +228,8 @@ def test_reproduce_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest
     assert outcome.exit_code == 1
     found = json.loads(outcome.stdout)
     assert (found["ok"], found["identical"]) == (False, False)
-    assert found["largest_difference"] == pytest.approx(1e-2, rel=1e-3)
+    assert 1e-2 / 3 < found["largest_difference"] < 3e-2
+    assert found["where"].endswith(", positions")
 
 
 def test_card_command(quick_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def draw(index: int) -> BlockParameters:
 
 
 def displacements(trajectory: Trajectory) -> Array:
-    """Of the recorded nodes, shape [frames, nodes, 2]."""
+    """Of the recorded nodes of any scene, shape [frames, nodes, dim]."""
     return trajectory.positions.astype(np.float64) - trajectory.mesh.rest_positions
 
 

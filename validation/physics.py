@@ -20,6 +20,7 @@ from typing import Any
 import block_cases
 import numpy as np
 import tissue_cases
+from block_cases import displacements
 from physics_variants import (
     STANDARD_GRAVITY,
     AlteredBlock,
@@ -41,7 +42,6 @@ from sheet_cases import relative_error
 from threadpoolctl import threadpool_limits
 
 from m3gn_bench.datasets.card import CARDS, fill
-from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.generators.falling import SIZE, FallingTeddy, FallParameters, MixedObjects
 from m3gn_bench.generators.scene import get_scene, scene_names
@@ -80,11 +80,6 @@ class Setup:
     reference: Callable[[Any], Any]
 
 
-def moved(trajectory: Trajectory) -> Array:
-    """Displacement of the recorded nodes, shape [frames, nodes, dim]."""
-    return trajectory.positions.astype(np.float64) - trajectory.mesh.rest_positions
-
-
 def sheet_draw(index: int) -> SheetParameters:
     """The modulus cycles with the index."""
     return SheetDeformation().sample(np.random.default_rng([SEED, index]), index)
@@ -104,8 +99,8 @@ def of_scene(name: str, draws: Sequence[Any]) -> Setup:
     scene = get_scene(name)
     return Setup(
         tuple(draws),
-        usual=lambda draw: moved(scene.simulate(draw)),
-        reference=lambda draw: moved(scene.simulate(draw, "reference")),
+        usual=lambda draw: displacements(scene.simulate(draw)),
+        reference=lambda draw: displacements(scene.simulate(draw, "reference")),
     )
 
 
@@ -171,7 +166,7 @@ class Term:
 
 def block(**changes: Any) -> Callable[[Any], Array]:
     """The block with other physics."""
-    return lambda draw: moved(AlteredBlock(**changes).simulate(draw))
+    return lambda draw: displacements(AlteredBlock(**changes).simulate(draw))
 
 
 def if_untouched(scene: str, rest: Callable[[Any, Array], Array]) -> Callable[[Any], Array]:
