@@ -97,8 +97,11 @@ class Cluster:
         self.file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard")
         self.workers: list[subprocess.Popen[bytes]] = []
+
+    def wait(self) -> None:
+        """Until the scheduler has written where it is: it makes the file first."""
         deadline = time.monotonic() + 60
-        while not self.file.exists():
+        while not (self.file.exists() and self.file.stat().st_size):
             assert time.monotonic() < deadline
             assert self.scheduler.poll() is None
             time.sleep(0.05)
@@ -128,8 +131,11 @@ def cluster(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
     monkeypatch.setenv("PYTHONPATH", str(HERE))
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", str(LOSSES))
     started = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield started
-    started.stop()
+    try:
+        started.wait()
+        yield started
+    finally:
+        started.stop()
 
 
 def test_a_killed_worker_of_dask_loses_nothing(
