@@ -6,10 +6,8 @@ matters; for that case a sketch of every trajectory is kept: a few numbers to wh
 """
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from m3gn_bench.datasets.errors import DatasetError
@@ -86,13 +84,9 @@ class Reproduction(Record):
 
 def sketch(trajectory: Trajectory) -> Sketch:
     """A trajectory's sketch."""
-    rounded = _rounded_arrays(trajectory)
-    digest = hash_arrays({k: v for k, v in trajectory.arrays().items() if k not in rounded})
-    shapes = {name: list(array.shape) for name, array in rounded.items()}
-    digest.update(json.dumps([shapes, trajectory.tags], sort_keys=True).encode())
-    numbers = [number for array in rounded.values() for number in _project(array)]
+    numbers = [number for array in _rounded_arrays(trajectory).values() for number in _project(array)]
     return Sketch(
-        discrete=digest.hexdigest()[:16], numbers=tuple(float(f"{number:.{DIGITS}g}") for number in numbers)
+        discrete=_discrete(trajectory), numbers=tuple(float(f"{number:.{DIGITS}g}") for number in numbers)
     )
 
 
@@ -103,7 +97,7 @@ def differences(trajectory: Trajectory, recorded: Sketch, scale_length: float) -
     themselves (Alon, Matias and Szegedy 1996): lengths over `scale_length`, anything else over its own root mean
     square. Infinite if what is not rounded differs.
     """
-    if sketch(trajectory).discrete != recorded.discrete:
+    if _discrete(trajectory) != recorded.discrete:
         return {"what is not rounded": np.inf}
     found, position = {}, 0
     for name, array in _rounded_arrays(trajectory).items():
@@ -114,6 +108,15 @@ def differences(trajectory: Trajectory, recorded: Sketch, scale_length: float) -
         unit = scale_length if is_length else float(np.sqrt(np.mean(np.square(array)))) or 1.0
         found[name] = float(np.sqrt(np.mean(np.square(np.subtract(numbers, expected))))) / unit
     return found
+
+
+def _discrete(trajectory: Trajectory) -> str:
+    """A hash of what is not rounded."""
+    rounded = _rounded_arrays(trajectory)
+    digest = hash_arrays({k: v for k, v in trajectory.arrays().items() if k not in rounded})
+    shapes = {name: list(array.shape) for name, array in rounded.items()}
+    digest.update(json.dumps([shapes, trajectory.tags], sort_keys=True).encode())
+    return digest.hexdigest()[:16]
 
 
 def _rounded_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
@@ -203,7 +206,13 @@ def compare(path: Path, folder: Path | None = None) -> Reproduction:
         recorded.require(metadata.dataset_version, metadata.tier)
         identical = content_hash(file, metadata.tier) == recorded.hashes[metadata.tier]
         keys = [key for key in stored_hashes(file) if key in recorded.sketches]
-        found = {} if identical else dict(_all_differences(file, keys, recorded, metadata.scale_length))
+        found = {
+            f"{key}, {name}": difference
+            for key in ([] if identical else keys)
+            for name, difference in differences(
+                read_trajectory(file, key), recorded.sketches[key], metadata.scale_length
+            ).items()
+        }
     # NaN is the worst that there can be.
     where = max(found, key=lambda name: np.nan_to_num(found[name], nan=np.inf), default="")
     return Reproduction(
@@ -215,12 +224,3 @@ def compare(path: Path, folder: Path | None = None) -> Reproduction:
         largest_difference=found.get(where, 0.0),
         where=where,
     )
-
-
-def _all_differences(
-    file: h5py.File, keys: list[str], recorded: RecordedDataset, scale_length: float
-) -> Iterator[tuple[str, float]]:
-    """The differences of all trajectories by trajectory and array."""
-    for key in keys:
-        of_key = differences(read_trajectory(file, key), recorded.sketches[key], scale_length)
-        yield from ((f"{key}, {name}", difference) for name, difference in of_key.items())
