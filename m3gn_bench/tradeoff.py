@@ -100,7 +100,7 @@ class Predicted(Record):
     error_to_data: float
     error_of_data: float
     training_seconds: float
-    weights_sha256: str | None = None
+    weights_sha256: str
     rival: str | None = None
     pays_off_after: int | None = None
     pays_off_with_data: int | None = None
