@@ -36,6 +36,7 @@ CODES = {
     "W001": "the file does not hold its whole tier",
     "W002": "the file holds something that the schema does not know",
     "W003": "the same trajectory is in two splits",
+    "W004": "nothing moves from one frame to the next",
 }
 TRAJECTORY_GROUP = {
     "positions",
@@ -118,7 +119,13 @@ def _trajectory_problems(
         yield Problem(code="W002", where=where, message=f"{name} is unknown to the schema")
     if trajectory.content_hash() != stored:
         yield Problem(code="E009", where=where, message="the content hash does not match")
-    yield from content_problems(trajectory, metadata, where)
+    problems = list(content_problems(trajectory, metadata, where))
+    yield from problems
+    if not problems:
+        still = np.flatnonzero((np.diff(trajectory.positions, axis=0) == 0).all(axis=(1, 2)))
+        if still.size:
+            message = f"no node moves from frame {still[0]} to the next ({still.size} such of {metadata.frames})"
+            yield Problem(code="W004", where=where, message=message)
 
 
 def content_problems(trajectory: Trajectory, metadata: Metadata, where: str) -> Iterator[Problem]:

@@ -302,9 +302,27 @@ def test_a_trajectory_in_two_splits_is_a_warning(tmp_path: Path, write_tetra: Te
     assert not validate(path, strict=True).ok
 
 
+def test_a_body_that_stops_is_a_warning(tmp_path: Path, write_tetra: TetraWriter) -> None:
+    """A solver that returned what it was given; but what lies on a floor in data of others may stand still."""
+
+    def stop(key: str, trajectory: Trajectory) -> Trajectory:
+        if key != "test_00001":
+            return trajectory
+        positions = trajectory.positions.copy()
+        positions[2:] = positions[1]
+        return replace(trajectory, positions=positions)
+
+    path = write_tetra(tmp_path / "still.h5", change=stop)
+    (problem,) = validate(path).problems
+    assert (problem.code, problem.where) == ("W004", "/trajectories/test_00001")
+    assert problem.message == "no node moves from frame 1 to the next (2 such of 4)"
+    assert validate(path).ok
+    assert not validate(path, strict=True).ok
+
+
 def test_every_code_is_planted() -> None:
     planted = {code for code, *_ in FILE_DEFECTS.values()} | {code for code, _ in CONTENT_DEFECTS.values()}
-    assert planted | {"W001", "W003"} == set(CODES)
+    assert planted | {"W001", "W003", "W004"} == set(CODES)
 
 
 def test_progress_is_reported(tetra_file: Path) -> None:
