@@ -124,7 +124,9 @@ def _trajectory_problems(
     if not problems:
         still = np.flatnonzero((np.diff(trajectory.positions, axis=0) == 0).all(axis=(1, 2)))
         if still.size:
-            message = f"no node moves from frame {still[0]} to the next ({still.size} such of {metadata.frames})"
+            message = (
+                f"no node moves from frame {still[0]} to the next ({still.size} such of {metadata.frames})"
+            )
             yield Problem(code="W004", where=where, message=message)
 
 
