@@ -27,6 +27,8 @@ Decisions where the paper and its parameter counts leave a choice:
 - Messages and vectors are averaged: sums grow with the number of neighbours, and diverge with depth.
 - The velocity is scaled by the updated h, or the last layer's phi_h would do nothing.
 - The layers' last weights for vectors start small, so that training starts from standing still.
+- What neighbours move a node by in a layer is limited per component, as in the authors' code: squared distances, which
+  messages read, throw out the further what is out already. In units of displacements the limit is far off.
 """
 
 import math
@@ -47,6 +49,7 @@ from m3gn_bench.model import ModelConfig, TrajectoryModel, hold_fixed
 from m3gn_bench.tasks import Task
 
 SMALL = 0.1  # of a usual initial weight
+FAR = 100.0  # standard deviations of displacements
 
 
 class EGNOConfig(ModelConfig):
@@ -182,7 +185,7 @@ class EquivariantLayer(nn.Module):
             received.index_add_(0, receivers, message.view(len(senders), *nodes.shape[1:]))
             pulled.index_add_(0, receivers, between * (scalar / scene.edge_length))
         mean = graph.inverse_degree[:, None]
-        return received * mean, pulled * mean
+        return received * mean, (pulled * mean).clamp(-FAR, FAR)
 
 
 class EGNO(TrajectoryModel):

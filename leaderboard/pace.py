@@ -12,8 +12,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+from m3gn_bench.checkpoint import Checkpoint
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.errors import ConfigError
+from m3gn_bench.model import load_preset
+from m3gn_bench.tasks import get_task
+
+PACE = Path(__file__).parent / "plans" / "pace.jsonl"  # of the models of this package
 
 
 class Measured(Record):
@@ -40,8 +45,12 @@ class Pace:
 
     def steps(self, preset: str, task: str, model: str, minutes: float) -> int:
         """The steps of so many minutes of one core. Raises ConfigError where nobody measured."""
+        return round(minutes * self.per_minute(preset, task, model))
+
+    def per_minute(self, preset: str, task: str, model: str) -> float:
+        """Steps of one minute of one core. Raises ConfigError where nobody measured."""
         try:
-            return round(minutes * self.steps_per_minute[preset, task, model])
+            return self.steps_per_minute[preset, task, model]
         except KeyError:
             raise ConfigError(
                 f"{self.path} has no pace of {model} with preset {preset!r} on {task}; measure it with "
@@ -68,3 +77,20 @@ def read_pace(path: Path) -> Pace:
         for model, pace in line.steps_per_minute.items()
     }
     return Pace(path, paces)
+
+
+def training_seconds(description: Checkpoint) -> float | None:
+    """CPU seconds of training, the same wherever a preset was trained: its steps at the pace of the reference machine.
+
+    Where no pace was measured, or settings are not the preset's, as long as it took on a CPU; None for other devices.
+    """
+    named = description.config
+    try:
+        steps = {"training.steps": named.training.get("steps")}
+        usual = load_preset(named.model_name, named.preset, get_task(description.task), steps)
+        if usual.hash() == description.config_hash:
+            pace = read_pace(PACE).per_minute(named.preset, description.task, named.model_name)
+            return 60 * description.steps / pace
+    except ConfigError:  # no such preset, or no pace
+        pass
+    return 60 * description.minutes if description.device == "cpu" else None

@@ -118,22 +118,31 @@ def _task_table(title: str, rows: Sequence[Entry]) -> str:
 
 def _runtimes(records: Sequence[ResultRecord], track: str) -> str:
     shown = titles(records)
-    boards = {name: {row.label: row for row in entries(records, track, name)} for name in shown}
-    boards = {name: rows for name, rows in boards.items() if rows}
+    boards = {
+        name: {row.label: row.seconds_per_prediction for row in rows}
+        for name in shown
+        if (rows := entries(records, track, name))
+    }
     models = dict.fromkeys(label for rows in boards.values() for label in rows)
+    machines = sorted({machine for rows in boards.values() for times in rows.values() for machine in times})
     lines = [
         "### Time per prediction",
         "",
-        "Milliseconds for a trajectory, mean over context sizes, the least of all seeds; one thread of a CPU, batches "
-        "of four, while a campaign's other processes have the other cores. Empty where all seeds were scored on a GPU.",
-        "",
-        _row(["model", *(shown[name] for name in boards)]),
-        _row(["---", *("--:" for _ in boards)]),
+        "Milliseconds for a trajectory, mean over context sizes, the least of the seeds that a machine scored; one "
+        "thread of a CPU, batches of four, while a campaign's other processes have the other cores. Only times of the "
+        "same machine can be compared, and those to a third. [Speed against accuracy](../docs/tradeoff.md) has times "
+        "of an otherwise idle machine.",
     ]
-    for label in models:
-        found = [rows.get(label) for rows in boards.values()]
-        seconds = [None if row is None else row.seconds_per_prediction for row in found]
-        lines.append(_row([label, *("" if s is None else f"{1e3 * s:.3g}" for s in seconds)]))
+    for machine in machines:
+        lines += [
+            "",
+            _row([machine, *(shown[name] for name in boards)]),
+            _row(["---", *("--:" for _ in boards)]),
+        ]
+        for label in models:
+            found = [rows.get(label, {}).get(machine) for rows in boards.values()]
+            if any(found):
+                lines.append(_row([label, *("" if s is None else f"{1e3 * s:.3g}" for s in found)]))
     return "\n".join([*lines, ""])
 
 

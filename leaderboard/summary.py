@@ -78,18 +78,17 @@ class Entry:
         return float(np.mean([one.minutes for one in trained if one.device == self.training_device]))
 
     @property
-    def seconds_per_prediction(self) -> float | None:
-        """Wall time of one prediction in batches, mean over contexts, the least of all seeds: other work only adds.
+    def seconds_per_prediction(self) -> dict[str, float]:
+        """Wall time of one prediction in batches by machine, mean over contexts, of one thread of a CPU.
 
-        Of one thread of a CPU only, whatever other records there are; None if there are no such.
+        The least of a machine's seeds: other work only adds.
         """
-        alike = [
-            record.evaluation_seconds
-            for record in self.records
-            if (record.evaluation_device, record.evaluation_threads) == ("cpu", 1)
-        ]
-        predictions = len(self.records[0].keys) * len(self.contexts)
-        return min(alike) / predictions if alike else None
+        found: dict[str, float] = {}
+        for record in self.records:
+            if (record.evaluation_device, record.evaluation_threads) == ("cpu", 1):
+                seconds = record.evaluation_seconds / (len(record.keys) * len(self.contexts))
+                found[record.machine] = min(seconds, found.get(record.machine, seconds))
+        return found
 
     @cached_property
     def contexts(self) -> tuple[int, ...]:

@@ -119,11 +119,18 @@ class Study:
 
 @dataclass(frozen=True)
 class Shipped:
-    """A trained model that takes part in a study: its name, its preset, and the folder of its checkpoint."""
+    """A trained model that takes part in a study.
+
+    Attributes:
+        name, preset: which one.
+        folder: of its checkpoint.
+        training_seconds: CPU seconds of its training; None: nobody knows.
+    """
 
     name: str
     preset: str
     folder: Path
+    training_seconds: float | None = None
 
     @property
     def key(self) -> str:

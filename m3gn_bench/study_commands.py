@@ -32,6 +32,7 @@ def _checkpoints(task: "Task", folders: tuple[Path, ...]) -> "list[Shipped]":
     """The trained models of a task that were asked for, or that ship with the project (preset compact, seed 0)."""
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.errors import CheckpointError
+    from m3gn_bench.leaderboard.pace import training_seconds
     from m3gn_bench.leaderboard.record import SHIPPED, checkpoint_folder, shipped_models
     from m3gn_bench.model import build_model, load_preset
     from m3gn_bench.studies import Shipped
@@ -39,13 +40,14 @@ def _checkpoints(task: "Task", folders: tuple[Path, ...]) -> "list[Shipped]":
     if not folders:
         names = shipped_models(task.name)
         learned = [n for n in names if build_model(load_preset(n, SHIPPED, task), task).is_learned]
-        return [Shipped(n, SHIPPED, checkpoint_folder(task.name, n, SHIPPED)) for n in learned]
+        folders = tuple(checkpoint_folder(task.name, n, SHIPPED) for n in learned)
     found = []
     for folder in folders:
         described = read_description(folder)
         if described.task != task.name:
             raise CheckpointError(f"{folder} was trained on {described.task}, not on {task.name}")
-        found.append(Shipped(described.config.model_name, described.config.preset, folder))
+        config = described.config
+        found.append(Shipped(config.model_name, config.preset, folder, training_seconds(described)))
     return found
 
 
@@ -132,7 +134,7 @@ def tradeoff(
                     f"{m.seconds:.3g}",
                     *map(percent, (m.error, m.error_to_data, m.error_of_data)),
                     "yes" if m.on_front else "",
-                    "never" if m.pays_off_after is None else m.pays_off_after,
+                    m.pays_off,
                 ]
                 for m in result.models
             ],

@@ -46,9 +46,9 @@ between the ratios of times there, so that the machine's noise does not decide; 
 is a factor of {EXTRAPOLATED_MARGIN:g}. *By parts* a setting lies on the front if no other is better when errors of
 steps and of the mesh count each for itself: a coarse mesh is another body, the same in all trajectories, while steps
 and tolerances add noise to its motion; so the default fidelity solves its mesh better than the total error asks for. A
-model **pays off** after so many trajectories as make its training (where it was trained) cheaper than the fastest
-simulator setting that is at least as accurate on the frames after the context; in parentheses, with the simulation of
-its training data.
+model **pays off** after so many trajectories as make its training (its steps at the
+pace of one core of the machine that the leaderboard's plans name) cheaper than the fastest simulator setting that is at
+least as accurate on the frames after the context; in parentheses, with the simulation of its training data.
 """
 
 STABILITY_HEADER = """## Stability
@@ -149,6 +149,8 @@ def advice(study: TradeOff) -> list[str]:
             third += f" from fidelity {study.models_by} over the rest of the trajectory"
         if best_model.rival is None:
             third += "; no simulator is as accurate."
+        elif best_model.training_seconds is None:
+            third += f"; {best_model.rival} is as accurate. Nobody knows what its training cost."
         elif best_model.pays_off_after is None:
             third += f" and never pays off: {best_model.rival} is as accurate and faster."
         else:
@@ -220,7 +222,7 @@ def _tradeoff(study: TradeOff) -> str:
             _row(["---", "--:", "--:", "--:", "--:", "--:", "--:", "---"]),
         ]
     for m in study.models:
-        after = "never" if m.pays_off_after is None else f"{m.pays_off_after} ({m.pays_off_with_data})"
+        after = m.pays_off if m.pays_off_after is None else f"{m.pays_off} ({m.pays_off_with_data})"
         shares = [_percent(e) for e in (m.error, m.error_to_data, m.error_of_data)]
         front = "yes" if m.on_front else ""
         lines.append(

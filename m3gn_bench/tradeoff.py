@@ -83,12 +83,12 @@ class Predicted(Record):
         error: distance from the reference, or from what else judges models (`TradeOff.models_by`).
         error_to_data: distance from the dataset's trajectory, the default fidelity's.
         error_of_data: distance of that from the same judge, over the same frames.
-        training_seconds: CPU seconds of training.
+        training_seconds: CPU seconds of training; None: nobody knows.
         weights_sha256: what of the models of that name and preset took part.
         rival: the fastest simulator setting that is at least as accurate, if there is one; of those that count as
             equally fast, the first.
         pays_off_after: number of trajectories after which training has paid for itself against the rival;
-            None: never, because the rival is faster or there is none.
+            None: never, because the rival is faster or there is none, or nobody knows what training cost.
         pays_off_with_data: the same if simulating the training data counts, too.
     """
 
@@ -99,12 +99,19 @@ class Predicted(Record):
     error: float
     error_to_data: float
     error_of_data: float
-    training_seconds: float
+    training_seconds: float | None
     weights_sha256: str
     rival: str | None = None
     pays_off_after: int | None = None
     pays_off_with_data: int | None = None
     on_front: bool = False
+
+    @property
+    def pays_off(self) -> str:
+        """`pays_off_after` for tables."""
+        if self.training_seconds is None:
+            return "unknown"
+        return "never" if self.pays_off_after is None else str(self.pays_off_after)
 
 
 class Convergence(Record):
@@ -324,7 +331,7 @@ def _pay_off(
     seconds, rival = next(r for r in rivals if r[0] <= time_margin * fastest)
     found: dict[str, Any] = {"rival": rival}
     saved = seconds - model.seconds
-    if saved > 0:
+    if saved > 0 and model.training_seconds is not None:
         found["pays_off_after"] = math.ceil(model.training_seconds / saved)
         found["pays_off_with_data"] = math.ceil((model.training_seconds + data_seconds) / saved)
     return model.model_copy(update=found)
@@ -588,7 +595,7 @@ class Bench:
             error=error,
             error_to_data=to_data,
             error_of_data=of_data,
-            training_seconds=60 * description.minutes,
+            training_seconds=one.training_seconds,
             weights_sha256=description.weights_sha256,
         )
 

@@ -171,6 +171,22 @@ def test_egno_does_not_turn_if_vectors_are_read_as_scalars(kind: str) -> None:
     assert error > 1e-4
 
 
+def test_what_neighbours_move_a_node_by_is_limited() -> None:
+    """One far node alone threw out its neighbours by hundreds of standard deviations, layer by layer."""
+    case, model = make_case("falling_teddy", 3), build("egno", "falling_teddy", training_cases("falling_teddy"))
+    assert isinstance(model, EGNO)
+    found = []
+    for scalar in (1e4, 1e6):
+        with torch.no_grad():
+            for layer in model.layers:
+                layer.vector_scalar[-1].bias.fill_(scalar)
+            context = case.context(10)
+            moved = (model.predict(context) - context.positions[-1]) / model.displacement_scale
+        found.append(moved.abs().max().item())
+    assert found[0] > egno.FAR  # the limit was reached
+    assert found[1] < 2.5 * egno.FAR * len(model.layers)  # the last layer's limit, and what convolutions add
+
+
 def test_egnos_horizon_is_fixed_and_its_tail_is_cut() -> None:
     """Later anchors see the same transform over time; beyond the end the collider is taken to rest."""
     kind = "tissue_manipulation"

@@ -36,7 +36,7 @@ from m3gn_bench.study_page import draw, is_converged, read_records, render
 from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")
-M3GN = Shipped("m3gn", "compact", checkpoint_folder(TASK.name, "m3gn", "compact"))
+M3GN = Shipped("m3gn", "compact", checkpoint_folder(TASK.name, "m3gn", "compact"), training_seconds=600.0)
 DEFAULT = SheetDeformation.fidelities["default"]
 SMALL = Knobs(
     draws=(4,),
