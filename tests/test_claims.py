@@ -138,6 +138,20 @@ def test_what_holds_in_part_or_has_no_record(monkeypatch: pytest.MonkeyPatch) ->
     assert verdict_of(monkeypatch, records) == "not testable here"
 
 
+def test_of_several_machines_the_one_that_says_least_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    records = [
+        r.model_copy(update={"machine": machine, "evaluation_seconds": seconds})
+        for r, machine, seconds in zip(
+            rows(2, a=1.0, b=1.0), ["one", "two"] * 2, [1.0, 1.0, 4.0, 1.2], strict=True
+        )
+    ]
+    faster = below("a", "b", of_time=True)
+    assert verdict_of(monkeypatch, records, faster) == "undecided"
+    assert verdict_of(monkeypatch, records, below("b", "a", of_time=True)) == "not reproduced"
+    assert verdict_of(monkeypatch, records, below("a", "b", of_time=True, margin=0.1)) == "reproduced"
+    assert verdict_of(monkeypatch, records, below("b", "a", of_time=True, margin=0.1)) == "not reproduced"
+
+
 def test_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     records = rows(a=1.0, b=1.0)
     slow = [r.model_copy(update={"evaluation_seconds": 2.0}) if r.model == "b" else r for r in records]

@@ -28,11 +28,12 @@ from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
 from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.generators.workers import run_jobs
+from m3gn_bench.leaderboard.pace import training_seconds
 from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.model import model_names
 from m3gn_bench.stability import MODEL_CELLS, REASONED
 from m3gn_bench.studies import Cell, Result, Shipped, Study, distance
-from m3gn_bench.study_page import draw, is_converged, read_records, render
+from m3gn_bench.study_page import advice, draw, is_converged, read_records, render
 from m3gn_bench.tasks import TASKS, get_task
 
 TASK = get_task("sheet_deformation")
@@ -515,6 +516,27 @@ def test_recorded_stability() -> None:
     unprepared = {"a tenth of the size", "ten times the size"}
     assert {cell.cell for cell in predicted if cell.verdict == "wrong"} <= unprepared
     assert all(REASONED.fullmatch(cell.detail) for cell in simulated if cell.verdict == "refused")
+
+
+def test_training_costs_the_same_wherever_a_preset_was_trained() -> None:
+    """The pace of one machine counts, not the minutes of an accelerator; other settings have other paces."""
+    shipped = read_description(M3GN.folder)
+    for device, minutes in (("cpu", 9.0), ("cuda", 0.1)):
+        elsewhere = shipped.model_copy(update={"device": device, "minutes": minutes})
+        assert training_seconds(elsewhere) == pytest.approx(600, rel=1e-3)
+        other = elsewhere.model_copy(update={"config_hash": "of other settings"})
+        assert training_seconds(other) == (540 if device == "cpu" else None)
+
+
+def test_what_training_cost_may_be_unknown() -> None:
+    tradeoffs, _ = read_records(RECORDS)
+    study = next(one for one in tradeoffs if one.task == TASK.name)
+    model = study.models[0].model_copy(
+        update={"training_seconds": None, "pays_off_after": None, "pays_off_with_data": None}
+    )
+    assert model.pays_off == "unknown"
+    unknown = study.model_copy(update={"models": (model,)})
+    assert "Nobody knows what its training cost" in advice(unknown)[-1]
 
 
 def test_studies_are_of_the_models_that_ship() -> None:
