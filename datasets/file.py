@@ -25,10 +25,19 @@ from m3gn_bench.datasets.schema import (
 from m3gn_bench.datasets.trajectory import Mesh, Trajectory, combine_hashes
 
 MAX_COMPRESSION = 1100  # gzip reaches 1032
+MAX_LISTED = 5  # files of a folder that stands where a file is needed
 
 
 def require_file(path: Path) -> None:
-    """Raises DatasetError if there is no file, or none that may be read."""
+    """Raises DatasetError if there is no file, or none that may be read; of a folder it says what is in it."""
+    if path.is_dir():
+        names = sorted(file.name for file in path.glob("*.h5"))
+        if not names:
+            raise DatasetError(
+                f"{path} is a folder without dataset files (*.h5); make one with 'm3gn-bench generate'"
+            )
+        others = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+        raise DatasetError(f"{path} is a folder; name a file in it: {', '.join(names[:MAX_LISTED])}{others}")
     if not path.is_file():
         raise DatasetError(f"no dataset file at {path}; make one with 'm3gn-bench generate'")
     if not os.access(path, os.R_OK):

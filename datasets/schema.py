@@ -16,6 +16,7 @@
 A key is <split>_<index>, e.g. test_00012. The file's content hash covers the trajectories' content hashes,
 so it does not depend on compression, on the HDF5 library or on the order of writing. It does not cover root
 attributes and splits. All strings are of fixed length: HDF5 guards those with checksums, and others not.
+`docs/format.md` says of every scene which fields it has, their shapes, units and meaning.
 """
 
 import json

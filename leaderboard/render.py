@@ -9,7 +9,8 @@ from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_b
 FIGURES = "figures"  # the folder beside the page
 PICTURES = {
     "overlay": "Predicted last frames, coloured by their distance from the truth, whose edges are drawn",
-    "latent": "M3GN's descriptions of all test trajectories, coloured by material (t-SNE)",
+    "latent": "M3GN's descriptions of all test trajectories at the middle context size, mean over nodes, coloured by "
+    "material (t-SNE)",
 }
 
 HEADER = """# Leaderboard

@@ -212,7 +212,8 @@ def evaluate(
 ) -> None:
     """Score a model over context sizes, beside the number on the leaderboard.
 
-    Test trajectories are simulated first if they are not there yet.
+    Test trajectories are simulated first if they are not there yet. What is recorded of the same model, preset and
+    seed is given for exactly these trajectories; with --tier paper they are all that the board averages over.
     """
     from m3gn_bench.checkpoint import read_description
     from m3gn_bench.cpu import use_cpu

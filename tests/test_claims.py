@@ -14,7 +14,7 @@ from m3gn_bench.leaderboard import claims
 from m3gn_bench.leaderboard.campaign import Job, carry_out, read_plan
 from m3gn_bench.leaderboard.claims import Claim, Comparison, render_claims
 from m3gn_bench.leaderboard.figures import draw_board
-from m3gn_bench.leaderboard.pictures import draw_latents, draw_overlays
+from m3gn_bench.leaderboard.pictures import agreement_of_neighbours, draw_latents, draw_overlays
 from m3gn_bench.leaderboard.record import ContextResult, ResultRecord, checkpoint_folder, write_record
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.metrics import TrajectoryErrors
@@ -217,6 +217,14 @@ def test_figures_show_the_recorded_numbers() -> None:
     assert line[0].get_ydata() == pytest.approx(expected)
     assert over_time.lines[1].get_ydata() == pytest.approx([records[-1].results[1].mse] * 46)
     assert draw_board(records, "compact", "deformable_block") is None
+
+
+def test_neighbours_agree_where_what_is_alike_is_close() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.integers(0, 9, 200).astype(float)
+    near = values[:, None] + 0.1 * rng.normal(size=(200, 3))
+    assert agreement_of_neighbours(near, values) > 0.98
+    assert abs(agreement_of_neighbours(rng.normal(size=(200, 3)), values)) < 0.2
 
 
 def test_pictures_of_trained_models(smoke_file: Path, tmp_path: Path) -> None:

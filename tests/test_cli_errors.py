@@ -214,13 +214,36 @@ def test_validate_names_the_problem(command: Command, bad_files: Path, name: str
         ("foreign", "no m3gn-bench dataset"),
         ("wrong-version", "schema version 99"),
         ("damaged-attribute", "root attributes: tier"),
-        (".", "no dataset file at"),
+        (".", "is a folder; name a file in it: valid.h5"),
     ],
 )
 def test_info_of_files_that_are_no_datasets(
     command: Command, bad_files: Path, name: str, message: str
 ) -> None:
     assert_one_line(command("info", bad_files / name), message, str(bad_files / name))
+
+
+@pytest.mark.parametrize("arguments", [["info"], ["validate"], ["export", "--format", "npz"]])
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ([], r"{} is a folder without dataset files \(\*\.h5\); make one with 'm3gn-bench generate'$"),
+        (["b.h5", "a.h5", "notes.txt"], r"{} is a folder; name a file in it: a\.h5, b\.h5$"),
+        ([f"{k}.h5" for k in range(7)], r"{} is a folder; .*: 0\.h5, 1\.h5, 2\.h5, 3\.h5, 4\.h5 and 2 more$"),
+    ],
+    ids=["none", "two", "seven"],
+)
+def test_a_folder_where_a_file_is_needed(
+    command: Command, arguments: list[str], files: list[str], message: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for name in files:
+        (folder / name).touch()
+    outcome = command(*arguments, folder)
+    assert_one_line(outcome, str(folder))
+    assert re.search(message.format(re.escape(str(folder))), outcome.errors.strip()), outcome.errors
+    assert sorted(path.name for path in folder.iterdir()) == sorted(files)
 
 
 # --- checkpoints ------------------------------------------------------------------------------------------

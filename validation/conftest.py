@@ -13,7 +13,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--part", default="1/1", help="run one of so many parts of the checks, e.g. 2/17")
+    parser.addoption("--part", default="1/1", help="run one of so many parts of the checks, e.g. 2/23")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     except ValueError:
         part, parts = 0, 0
     if not 1 <= part <= parts:
-        raise pytest.UsageError(f"--part {given!r} is not like 2/17: a number, and of how many")
+        raise pytest.UsageError(f"--part {given!r} is not like 2/23: a number, and of how many")
     chosen = items[part - 1 :: parts]
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = chosen
