@@ -65,8 +65,8 @@ class Grid(Record):
     seeds: tuple[Annotated[int, Field(ge=0, le=LARGEST_SEED)], ...] = Field(default=(0,), min_length=1)
     shipped_seeds: tuple[int, ...] = ()
     preset: str = "compact"
-    minutes: float | None = None
-    steps: int | None = None
+    minutes: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    steps: int | None = Field(default=None, gt=0)
     variant: Variant = ""
     settings: dict[str, Any] = Field(default={})
     materials: Materials = Field(default={})

@@ -1,6 +1,7 @@
 """Re-derive recorded numbers from nothing: simulate, run the shipped checkpoint or train again, compare."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from m3gn_bench.datasets.schema import Record
 from m3gn_bench.evaluation import evaluate_model
 from m3gn_bench.leaderboard.campaign import Outcome
 from m3gn_bench.leaderboard.consistency import contradictions
-from m3gn_bench.leaderboard.record import HASH_DIGITS, ResultRecord, checkpoint_folder, find_record
+from m3gn_bench.leaderboard.record import HASH_DIGITS, HOME, ResultRecord, checkpoint_folder, find_record
 from m3gn_bench.sources import regenerate
 from m3gn_bench.tasks import get_task
 
@@ -71,23 +72,25 @@ def check_records(
     *,
     trajectories: int,
     offset: int,
+    home: Path = HOME,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> CheckReport:
-    """Re-derive the errors of some trajectories of records whose checkpoints ship with the project.
+    """Re-derive the errors of some trajectories of records whose checkpoints ship with the leaderboard.
 
     Args:
         records: what to check.
         trajectories: how many per record.
         offset: which ones, see `chosen`.
+        home: the leaderboard's folder, with the checkpoints.
         on_progress: called with (done, total) after every record.
     """
     compared: list[Comparison] = []
     problems: list[str] = []
     for done, record in enumerate(records, 1):
         where = f"{record.task}/{record.name}"
-        folder = checkpoint_folder(record.task, record.model, record.preset, record.seed)
+        folder = checkpoint_folder(record.task, record.model, record.preset, record.seed, home)
         if not folder.is_dir():
-            problems.append(f"{where}: its checkpoint does not ship with the project")
+            problems.append(f"{where}: its checkpoint does not ship: there is no {folder}")
             continue
         try:
             model, description = load_checkpoint(folder)

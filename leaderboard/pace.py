@@ -26,7 +26,7 @@ class Measured(Record):
 
     preset: str
     task: str
-    steps_per_minute: dict[str, Annotated[float, Field(gt=0)]]  # of CPU time, by model
+    steps_per_minute: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]]  # of CPU time, by model
     machine: str
     commit: str | None
 

@@ -102,7 +102,7 @@ class ResultRecord(Record):
     variant: Variant = ""
     materials: Materials = Field(default={})
     seed: int
-    parameters: int
+    parameters: int = Field(ge=0)
     tier: str
     split: str
     dataset_version: str
@@ -114,7 +114,7 @@ class ResultRecord(Record):
     machine: str
     evaluation_device: str
     evaluation_threads: int
-    evaluation_seconds: float = Field(ge=0)
+    evaluation_seconds: float = Field(gt=0, allow_inf_nan=False)
     checkpoint: Checkpoint
     ships: bool
     results: tuple[ContextResult, ...]

@@ -1,16 +1,20 @@
 """Take a record that somebody else made onto the board, if it is what it says."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
+from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import IMPORTED, Record
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.consistency import contradictions
-from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, find_record
+from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, checkpoint_folder, find_record
+from m3gn_bench.leaderboard.summary import entries
 from m3gn_bench.model import load_preset, model_names
 from m3gn_bench.tasks import get_task
 from m3gn_bench.version import __version__
 
 LONG = 1.5  # times as long as all others of a board; machines differ, too
+LARGE = 2.0  # times as large as all others of a board, which are of one preset
 
 
 class Verdict(Record):
@@ -28,9 +32,11 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         board: all records there are.
         replace: whether it may take the place of the record of that name.
     """
-    problems, remarks = [], []
+    problems, remarks = [], _new_track(record, board)
     if replace:
         taken = find_record(board, record.track, record.task, record.name)
+        if taken is not None and taken.ships:
+            problems.append(_without_checkpoint(taken))
         board = [peer for peer in board if peer is not taken]
     if record.record_schema != RECORD_SCHEMA:
         problems.append(
@@ -50,7 +56,10 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         problems.append("it is of some materials only; name them by a variant")
     problems += contradictions(record)
     if record.model not in model_names():
-        remarks.append(f"{record.model} is not installed here: its settings and parameters were not checked")
+        remarks.append(
+            f"{record.model} is not installed here: whether its settings are those of preset {record.preset!r}, and "
+            "how many parameters that makes, was not checked"
+        )
     elif not problems and not record.variant and not _is_of_preset(record):
         problems.append(
             f"its settings are not those of preset {record.preset!r}; name what differs by a variant"
@@ -62,8 +71,18 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         if made_by is not None and made_by.endswith("+changes"):
             remarks.append(f"it was {what} by code with changes that no commit holds ({made_by})")
 
-    problems += _unequal_conditions(record, board)
-    remarks += _long_training(record, board)
+    problems += _unequal_conditions(record, board) + _copied(record, board)
+    remarks += _fair_budget(record, board) + _large(record, board)
+    of_data = _compared_data(record, board)
+    problems += of_data.problems
+    remarks += of_data.remarks
+    if not problems:
+        problems += _without_a_place(record, board)
+    return Verdict(problems=tuple(problems), remarks=tuple(remarks))
+
+
+def _compared_data(record: ResultRecord, board: Sequence[ResultRecord]) -> Verdict:
+    """What the records of the same trajectories say of the submission's."""
     peers = [
         peer
         for peer in board
@@ -71,8 +90,9 @@ def review(record: ResultRecord, board: Sequence[ResultRecord], replace: bool = 
         == (record.task, record.tier, record.split, record.materials)
     ]
     if not peers:
-        remarks.append("nothing on the board was scored on such trajectories: the data were not compared")
-        return Verdict(problems=tuple(problems), remarks=tuple(remarks))
+        unknown = "nothing on the board was scored on such trajectories: the data were not compared"
+        return Verdict(problems=(), remarks=(unknown,))
+    problems, remarks = [], []
     trained_on = {peer.checkpoint.dataset_hash for peer in peers}
     if record.checkpoint.dataset_hash not in trained_on:
         remarks.append(
@@ -102,33 +122,99 @@ def _is_of_preset(record: ResultRecord) -> bool:
     return record.checkpoint.config_hash == usual.hash()
 
 
-def _long_training(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+def _without_checkpoint(taken: ResultRecord) -> str:
+    folder = checkpoint_folder(taken.task, taken.model, taken.preset, taken.seed, Path())
+    return (
+        f"{taken.task}/{taken.name} ships with its checkpoint, which would be left without its record: put the new one "
+        f"into {folder} of the leaderboard, and score it there with 'm3gn-bench evaluate --record --replace'"
+    )
+
+
+def _new_track(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    tracks = sorted({peer.track for peer in board})
+    if record.track in tracks:
+        return []
+    return [
+        f"there is no track {record.track!r} yet, so a new board begins with it; known: {', '.join(tracks) or 'none'}"
+    ]
+
+
+def _copied(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    """Whose weights or errors it has, though training with another seed or of another model never ends in the same.
+
+    One checkpoint may be on several tracks, and there its model may have another name: what an ablation changes is part
+    of some presets.
+    """
+    if not record.checkpoint.steps:  # what does not learn is the same for every seed
+        return []
+    errors = [result.trajectory_mse for result in record.results]
+    for peer in board:
+        is_another = peer.seed != record.seed or (peer.track == record.track and peer.name != record.name)
+        if peer.task != record.task or not is_another:
+            continue
+        of_peer = f"those of {peer.name} in track {peer.track!r}: train it with a seed of its own"
+        if peer.checkpoint.weights_sha256 == record.checkpoint.weights_sha256:
+            return [f"its weights are {of_peer}"]
+        if [result.trajectory_mse for result in peer.results] == errors:
+            return [f"its errors are, to the last digit, {of_peer}"]
+    return []
+
+
+def _large(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    beside = [peer for peer in board if (peer.track, peer.task) == (record.track, record.task)]
+    most = max((peer.parameters for peer in beside), default=0)
+    if not most or record.parameters <= LARGE * most:
+        return []
+    return [
+        f"it has {record.parameters} parameters, the others of its board {most} at most: is that the size of preset "
+        f"{record.preset!r}?"
+    ]
+
+
+def _fair_budget(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
     """What to ask of its minutes and steps: only the budget of a model that the board has is compared as such."""
     own = record.checkpoint
-    others = [
-        peer.checkpoint
+    beside = [
+        peer
         for peer in board
         if (peer.track, peer.task) == (record.track, record.task) and peer.checkpoint.steps
     ]
-    if not own.steps or not others:
+    if not own.steps or not beside:
         return []
     remarks = []
-    longest, most = (max(getattr(peer, what) for peer in others) for what in ("minutes", "steps"))
-    if own.minutes > LONG * longest:
+    longest = max((p.checkpoint.minutes for p in beside if _device(p) == _device(record)), default=None)
+    most = max(peer.checkpoint.steps for peer in beside)
+    if longest is not None and own.minutes > LONG * longest:
         remarks.append(
-            f"it was trained for {own.minutes:.3g} minutes, the others of its board for {longest:.3g} at most: is its "
-            "machine so much slower?"
+            f"it was trained for {own.minutes:.3g} minutes of {_device(record)}, the others of its board for "
+            f"{longest:.3g} at most: is its machine so much slower?"
         )
     if own.steps > LONG * most:
         remarks.append(
             f"it was trained for {own.steps} steps, the others of its board for {most} at most: are its steps so much "
             "cheaper?"
         )
-    elif own.device not in {peer.device for peer in others}:
+    if not any((peer.model, peer.preset) == (record.model, record.preset) for peer in beside):
+        of_m3gn = [peer.checkpoint.steps for peer in beside if peer.model == "m3gn"]
+        usual = f"{max(of_m3gn)} of m3gn" if of_m3gn else f"{most} at most of others"
         remarks.append(
-            f"it was trained on {own.device}, so its minutes say nothing: are {own.steps} steps a fair budget?"
+            f"its board has no other {record.model}: are {own.steps} steps a fair budget beside the {usual}?"
         )
     return remarks
+
+
+def _device(record: ResultRecord) -> str:
+    """The kind of device that trained it, whichever of several that was."""
+    return record.checkpoint.device.partition(":")[0]
+
+
+def _without_a_place(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:
+    """Why its board cannot be made with it."""
+    try:
+        entries([*board, record], record.track, record.task)
+    except BenchError as error:
+        return [f"the board cannot be made with it: {error}"]
+    return []
 
 
 def _unequal_conditions(record: ResultRecord, board: Sequence[ResultRecord]) -> list[str]:

@@ -23,6 +23,12 @@ BOARD = click.option(
     required=True,
     help="The leaderboard's folder, where records go (in a checkout: leaderboard).",
 )
+ANY_BOARD = click.option(
+    "--home",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    default=None,
+    help="A leaderboard's folder.  [default: the project's own]",
+)
 
 
 @click.group()
@@ -31,16 +37,17 @@ def leaderboard() -> None:
 
 
 @leaderboard.command()
+@ANY_BOARD
 @click.option("--task", "task_name", default=None, help="Only this task.")
 @JSON
-def show(task_name: str | None, as_json: bool) -> None:
+def show(home: Path | None, task_name: str | None, as_json: bool) -> None:
     """All result records."""
-    from m3gn_bench.leaderboard.record import read_records
+    from m3gn_bench.leaderboard.record import HOME, read_records
     from m3gn_bench.tasks import get_task
 
     if task_name is not None:
         get_task(task_name)
-    records = [r for r in read_records() if task_name in (None, r.task)]
+    records = [r for r in read_records(home or HOME) if task_name in (None, r.task)]
     rows: list[list[object]] = [
         [
             r.track,
@@ -68,12 +75,7 @@ def show(task_name: str | None, as_json: bool) -> None:
 
 
 @leaderboard.command()
-@click.option(
-    "--home",
-    type=click.Path(path_type=Path, file_okay=False, exists=True),
-    default=None,
-    help="A leaderboard's folder.  [default: the project's own]",
-)
+@ANY_BOARD
 @click.option("--check", is_flag=True, help="Write nothing; exit code 1 if a page is out of date.")
 @JSON
 def render(home: Path | None, check: bool, as_json: bool) -> None:
@@ -116,6 +118,7 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
 
 
 @leaderboard.command()
+@ANY_BOARD
 @click.option("--task", "task_name", default=None, help="Only this task.")
 @click.option(
     "-o",
@@ -128,7 +131,15 @@ def render(home: Path | None, check: bool, as_json: bool) -> None:
 @WORKERS
 @DATA
 @JSON
-def pictures(task_name: str | None, output: Path, tier: str, workers: int, data: Path, as_json: bool) -> None:
+def pictures(
+    home: Path | None,
+    task_name: str | None,
+    output: Path,
+    tier: str,
+    workers: int,
+    data: Path,
+    as_json: bool,
+) -> None:
     """Draw what the shipped checkpoints do: final frames over the truth, and M3GN's task descriptions (t-SNE).
 
     Test trajectories are simulated first if they are not there yet. Needs the extra `plot`.
@@ -145,21 +156,23 @@ def pictures(task_name: str | None, output: Path, tier: str, workers: int, data:
     from m3gn_bench.tasks import TASKS, get_task
 
     report = Report(as_json)
+    folder = home or HOME
     require_drawable(output / "picture.png")
     names = list(TASKS) if task_name is None else [get_task(task_name).name]
-    records = [r for r in read_records() if r.ships and r.track == "compact" and r.checkpoint.steps > 0]
+    records = [r for r in read_records(folder) if r.ships and r.track == "compact" and r.checkpoint.steps > 0]
     written = []
     for name in names:
         task = get_task(name)
         shown = [record for record in records if record.task == name]
-        if not any(record.model == "m3gn" for record in shown):
+        m3gn = next((record for record in shown if record.model == "m3gn"), None)
+        if m3gn is None:
             continue
         with report.progress(f"simulating {task.scene}") as on_progress:
             path = find_or_generate(
                 task, tier, data, splits=("test",), workers=workers, on_progress=on_progress
             )
-        save(draw_overlays(shown, task, path, tier, HOME), output / f"overlay-{name}.png")
-        model, _ = load_checkpoint(checkpoint_folder(name, "m3gn", "compact"))
+        save(draw_overlays(shown, task, path, tier, folder), output / f"overlay-{name}.png")
+        model, _ = load_checkpoint(checkpoint_folder(name, "m3gn", m3gn.preset, m3gn.seed, folder))
         assert isinstance(model, M3GN)
         cases = load_cases(path, task, "test", tier)
         save(draw_latents(model, cases, middle(task.context_sizes)), output / f"latent-{name}.png")
@@ -168,6 +181,7 @@ def pictures(task_name: str | None, output: Path, tier: str, workers: int, data:
 
 
 @leaderboard.command("check")
+@ANY_BOARD
 @click.option("--task", "task_name", default=None, help="Only this task.")
 @click.option(
     "--records",
@@ -188,6 +202,7 @@ def pictures(task_name: str | None, output: Path, tier: str, workers: int, data:
 @WORKERS
 @JSON
 def check_command(
+    home: Path | None,
     task_name: str | None,
     count: int,
     trajectories: int,
@@ -198,8 +213,8 @@ def check_command(
 ) -> None:
     """Re-derive numbers from nothing and compare with the records; exit code 1 where they differ.
 
-    Trajectories are simulated again. Models are the checkpoints that ship with the project, and the small ones of track
-    smoke, which are trained again.
+    Trajectories are simulated again. Models are the checkpoints that ship with the leaderboard, and the small ones of
+    its plan smoke, if it has one, which are trained again.
     """
     from m3gn_bench.cpu import use_cpu
     from m3gn_bench.leaderboard.campaign import PLANS, read_plan
@@ -212,22 +227,27 @@ def check_command(
         compare_with_retrained,
         sample,
     )
-    from m3gn_bench.leaderboard.record import read_records
+    from m3gn_bench.leaderboard.record import HOME, read_records
     from m3gn_bench.tasks import get_task
 
+    folder = home or HOME
     use_cpu(usable_cores())
     if task_name is not None:
         get_task(task_name)
-    records = [r for r in read_records() if task_name in (None, r.task)]
+    records = [r for r in read_records(folder) if task_name in (None, r.task)]
     report = Report(as_json)
     shipped = [record for record in records if record.ships]
     today = date.today().toordinal() if offset is None else offset
     sampled, rounds = sample(shipped, count, today)
     with report.progress("re-deriving") as on_progress:
-        found = check_records(sampled, trajectories=trajectories, offset=rounds, on_progress=on_progress)
+        found = check_records(
+            sampled, trajectories=trajectories, offset=rounds, home=folder, on_progress=on_progress
+        )
     compared, problems = list(found.compared), [*check_statements(records), *found.problems]
-    if retrain:
-        planned = [run for run in read_plan(PLANS / "smoke.toml") if task_name in (None, run.task)]
+    plans = PLANS if home is None else home / "plans"
+    plan = plans / "smoke.toml"
+    if retrain and (home is None or plan.is_file()):  # another board need not have one
+        planned = [run for run in read_plan(plan) if task_name in (None, run.task)]
         with report.progress("training again") as on_progress:
             again = compare_with_retrained(records, _train_again(planned, workers, on_progress))
         compared += again.compared
@@ -258,7 +278,7 @@ def check_command(
         unseen = len(shipped) - runs([c for c in outcome.compared if c.kind == "shipped checkpoint"])
         lines.append(
             f"{left} records were not looked at: {unseen} are sampled by other values of --offset, the others can only "
-            "be re-derived by training (see the plans in leaderboard/plans)"
+            f"be re-derived by training (see the plans in {plans})"
         )
     if not outcome.compared and not outcome.problems:
         lines.append("there is nothing to compare: no record has a checkpoint here, or is of track smoke")

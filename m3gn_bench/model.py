@@ -36,7 +36,7 @@ class TrainingConfig(ModelConfig):
     and loading are not counted), so that "10 minutes on one core" means the same on a busy machine.
     """
 
-    minutes: float | None = Field(default=None, gt=0)
+    minutes: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     steps: int | None = Field(default=None, gt=0)
     batch_size: int = Field(default=1, ge=1)  # trajectories per step
     learning_rate: float = Field(default=5e-4, gt=0)

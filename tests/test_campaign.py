@@ -27,6 +27,7 @@ from m3gn_bench.tasks import TASKS, get_task
 
 SCRIPT = Path(sys.executable).parent / "m3gn-bench"
 HEAD = 'track = "trial"\ntier = "smoke"\n'
+PACED = HEAD + f'pace = "{PLANS / "pace.jsonl"}"\n'
 GRID = """
 [[runs]]
 tasks = ["sheet_deformation"]
@@ -199,6 +200,11 @@ def _alive(session: int) -> bool:
         ("track = ", "cannot read"),
         (HEAD, "runs"),
         (HEAD + GRID + "minute = 3\n", r"runs.0.minute"),
+        (PACED + GRID.replace("steps = 3", "minutes = inf"), r"runs.0.minutes: Input should be a finite"),
+        (PACED + GRID.replace("steps = 3", "minutes = nan"), r"runs.0.minutes: Input should be"),
+        (PACED + GRID.replace("steps = 3", "minutes = 0"), r"runs.0.minutes: Input should be greater than 0"),
+        (HEAD + GRID.replace("steps = 3", "minutes = inf"), r"runs.0.minutes: Input should be a finite"),
+        (HEAD + GRID.replace("steps = 3", "steps = 0"), r"runs.0.steps: Input should be greater than 0"),
         (HEAD + GRID.replace("m3gn", "magnet"), "unknown model 'magnet'"),
         (HEAD + GRID.replace("sheet_deformation", "sheet"), "table 1: unknown task 'sheet'"),
         (HEAD + GRID.replace("steps = 3", ""), "give a budget"),
@@ -297,9 +303,10 @@ def test_minutes_are_steps_of_the_reference_machine(tmp_path: Path) -> None:
     path.write_text(json.dumps(lines[0]) + "\n" + json.dumps(lines[1] | {"machine": "another"}) + "\n")
     with pytest.raises(ConfigError, match="must be of one machine, and is of another, one"):
         read_plan(plan)
-    path.write_text("{}\n")
-    with pytest.raises(ConfigError, match="cannot read the pace"):
-        read_plan(plan)
+    for line in ("{}", json.dumps(lines[0] | {"steps_per_minute": {"mgn": np.inf}})):
+        path.write_text(line + "\n")
+        with pytest.raises(ConfigError, match="cannot read the pace"):
+            read_plan(plan)
 
 
 def test_runs_on_other_materials_have_folders_of_their_own(smoke_file: Path, tmp_path: Path) -> None:

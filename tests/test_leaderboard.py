@@ -1,5 +1,6 @@
 """Records, tables, and the check: it must pass on the truth and fail on every planted error."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from m3gn_bench.cli import run
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.generators import sheet_deformation
 from m3gn_bench.generators.scene import get_scene
-from m3gn_bench.leaderboard import campaign, check, record, render, submission, summary
+from m3gn_bench.leaderboard import check, consistency, record, render, submission, summary
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records, write_record
 from m3gn_bench.metrics import TrajectoryErrors
 from m3gn_bench.model import RunConfig
@@ -50,33 +51,27 @@ def fresh_simulations() -> Iterator[None]:
     sources._simulate.cache_clear()
 
 
-@pytest.fixture
-def use_board(board: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=board))
-    return board
+def run_check(records: list[ResultRecord], home: Path) -> check.CheckReport:
+    return check.check_records(records, trajectories=1, offset=0, home=home)
 
 
-def run_check(records: list[ResultRecord]) -> check.CheckReport:
-    return check.check_records(records, trajectories=1, offset=0)
-
-
-def test_check_rederives_every_number(use_board: Path) -> None:
-    report = run_check(read_records(use_board))
+def test_check_rederives_every_number(board: Path) -> None:
+    report = run_check(read_records(board), board)
     assert report.ok, report
     assert len(report.compared) == 2 * 3  # models, context sizes
     assert all(c.same_trajectory for c in report.compared)
 
 
-def test_planted_error_in_a_record_is_found(use_board: Path) -> None:
+def test_planted_error_in_a_record_is_found(board: Path) -> None:
     """One percent on everything at one context size: consistent in itself, so only re-deriving finds it."""
-    records = read_records(use_board)
+    records = read_records(board)
     wrong = records[0].model_dump()
     result = wrong["results"][1]
     for name in ("mse", "mse_free_nodes"):
         result[name] *= 1.01
     for name in ("per_timestep_mse", "trajectory_mse", "trajectory_mse_free_nodes"):
         result[name] = [1.01 * value for value in result[name]]
-    report = run_check([ResultRecord.model_validate(wrong), *records[1:]])
+    report = run_check([ResultRecord.model_validate(wrong), *records[1:]], board)
     assert not report.ok
     assert sum(not c.ok for c in report.compared) == 1
 
@@ -104,55 +99,50 @@ def test_a_record_needs_one_error_per_trajectory(board: Path) -> None:
         ResultRecord.model_validate(wrong)
 
 
-def test_planted_error_in_a_generator_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_error_in_a_generator_is_found(board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sheet_deformation, "THICKNESS", 2.02)
-    report = run_check(read_records(use_board))
+    report = run_check(read_records(board), board)
     assert not report.ok
     assert not any(c.same_trajectory for c in report.compared)
 
 
-def test_planted_error_in_weights_is_found(
-    use_board: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_planted_error_in_weights_is_found(board: Path, tmp_path: Path) -> None:
     """A checkpoint that was replaced is not the recorded one, even if it is consistent in itself."""
-    original = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=use_board)
-    weights = load_file(original / "weights.safetensors")
+    shutil.copytree(board / "checkpoints", tmp_path / "checkpoints")
+    path = checkpoint_folder("sheet_deformation", "mgn", "smoke", home=tmp_path) / "weights.safetensors"
+    weights = load_file(path)
     weights["simulator.network.readout.bias"] += 1e-3
-    save_file(weights, tmp_path / "weights.safetensors")
-    (tmp_path / "checkpoint.json").write_bytes((original / "checkpoint.json").read_bytes())
-    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: tmp_path)
-    report = run_check(read_records(use_board))
+    save_file(weights, path)
+    report = run_check([one for one in read_records(board) if one.model == "mgn"], tmp_path)
     assert not report.ok
-    assert all("SHA-256" in problem for problem in report.problems)
+    (problem,) = report.problems
+    assert "SHA-256" in problem
 
 
-def test_a_model_that_is_not_there_is_named(
-    use_board: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_that_is_not_there_is_named(board: Path, tmp_path: Path) -> None:
     """Beside what else was found."""
-    honest = next(r for r in read_records(use_board) if r.model == "stand_still")
-    original = checkpoint_folder("sheet_deformation", "stand_still", "smoke", home=use_board)
-    shutil.copytree(original, tmp_path / "gone")
-    description = tmp_path / "gone" / "checkpoint.json"
+    honest = next(r for r in read_records(board) if r.model == "stand_still")
+    shutil.copytree(board / "checkpoints", tmp_path / "checkpoints")
+    original, copied = (
+        checkpoint_folder("sheet_deformation", model, "smoke", home=tmp_path)
+        for model in ("stand_still", "gone")
+    )
+    shutil.copytree(original, copied)
+    description = copied / "checkpoint.json"
     description.write_text(description.read_text().replace('"stand_still"', '"gone"'))
     gone = honest.model_copy(update={"model": "gone"})
-    monkeypatch.setattr(
-        check,
-        "checkpoint_folder",
-        lambda task, model, *_: original if model == "stand_still" else tmp_path / "gone",
-    )
-    report = run_check([gone, honest])
+    report = run_check([gone, honest], tmp_path)
     assert len(report.compared) == 3
     (problem,) = report.problems
     assert "unknown model 'gone'" in problem
 
 
-def test_planted_error_in_a_model_is_found(use_board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_error_in_a_model_is_found(board: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from m3gn_bench.baselines.mgn import StepSimulator
 
     original = StepSimulator.forward
     monkeypatch.setattr(StepSimulator, "forward", lambda self, *args: 1.1 * original(self, *args))
-    report = run_check([r for r in read_records(use_board) if r.model == "mgn"])
+    report = run_check([r for r in read_records(board) if r.model == "mgn"], board)
     assert not report.ok
 
 
@@ -170,6 +160,11 @@ def fewer(values: dict[str, Any], count: int) -> dict[str, Any]:
     return values
 
 
+def described(values: dict[str, Any], **changes: object) -> dict[str, Any]:
+    """With other statements of its checkpoint."""
+    return values | {"checkpoint": values["checkpoint"] | changes}
+
+
 @pytest.mark.parametrize(
     ("plant", "reason"),
     [
@@ -179,6 +174,11 @@ def fewer(values: dict[str, Any], count: int) -> dict[str, Any]:
         (lambda values: values | {"seed": 3}, "checkpoint's task, model, preset and seed"),
         (lambda values: values | {"results": values["results"][1:]}, "context sizes"),
         (lambda values: values | {"split": "exam"}, "unknown split 'exam'"),
+        (lambda values: described(values, best_step=4), "best_step: 4, not one of 3 steps"),
+        (lambda values: described(values, best_step=-1), "best_step: -1, not one of 3 steps"),
+        (lambda values: described(values, minutes=-1.0), "minutes: -1.0, not a time that training takes"),
+        (lambda values: described(values, minutes=np.inf), "minutes: inf, not a time that training takes"),
+        (lambda values: described(values, minutes=np.nan), "minutes: nan, not a time that training takes"),
         (
             lambda values: values | {"keys": [f"train_{index:05}" for index in range(4)]},
             "trajectories: train_00000 is none of the test split of tier smoke",
@@ -232,33 +232,19 @@ def test_the_command_fails_where_a_record_does(
     """By its exit code, which CI goes by, whatever is wrong."""
     home = tmp_path / "home"
     shutil.copytree(board, home, ignore=shutil.ignore_patterns("mgn-*"))  # whose rollouts take long
-    plan = tmp_path / "smoke.toml"
+    plan = home / "plans" / "smoke.toml"
+    plan.parent.mkdir()
     plan.write_text(
         'track = "test"\ntier = "smoke"\n[[runs]]\ntasks = ["sheet_deformation"]\n'
         f'models = ["{model}"]\npreset = "smoke"\nshipped_seeds = [0]\n'
     )
-    monkeypatch.setattr(campaign, "PLANS", tmp_path)
     if reason is not None:  # else the data are made for training, too, as users have it
         monkeypatch.setattr(sources, "find_or_generate", lambda *_, **__: smoke_file)
-    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: checkpoint_folder(*run, home=home))
-    monkeypatch.setattr(record, "read_records", lambda: read_records(home))
     (honest,) = read_records(home)
     write_record(plant(honest), home)
+    command = ["leaderboard", "check", "--home", str(home), "--trajectories", "1", "--offset", "0"]
     with pytest.raises(SystemExit) as stop:
-        run(
-            [
-                "leaderboard",
-                "check",
-                "--trajectories",
-                "1",
-                "--offset",
-                "0",
-                "--workers",
-                "1",
-                "--json",
-                *options,
-            ]
-        )
+        run([*command, "--workers", "1", "--json", *options])
     outcome = json.loads(capsys.readouterr().out)
     assert (stop.value.code, outcome["ok"]) == ((0, True) if reason is None else (1, False))
     assert {c["kind"] for c in outcome["compared"]} == kinds
@@ -267,6 +253,21 @@ def test_the_command_fails_where_a_record_does(
     found = [*outcome["problems"], *["recorded and re-derived differ"] * bool(different)]
     assert len(found) == (reason is not None)
     assert all(str(reason) in problem for problem in found)
+
+
+def test_a_board_without_a_plan_is_checked(
+    board: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its checkpoints are; there is nothing to train again."""
+    home = tmp_path / "home"
+    shutil.copytree(board, home, ignore=shutil.ignore_patterns("mgn-*"))
+    with pytest.raises(SystemExit) as stop:
+        run(["leaderboard", "check", "--home", str(home), "--trajectories", "1", "--json"])
+    outcome = json.loads(capsys.readouterr().out)
+    assert (stop.value.code, outcome["problems"]) == (0, [])
+    assert [(one["run"], one["kind"]) for one in outcome["compared"]] == [
+        ("stand_still-smoke-s0", "shipped checkpoint")
+    ] * 3
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 99])
@@ -297,12 +298,9 @@ def test_repeated_checks_come_to_every_trajectory() -> None:
     assert seen == {f"{one.task}/{one.name}": set(range(135)) for one in records}
 
 
-def test_missing_checkpoint_and_empty_board_are_problems(
-    use_board: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert not run_check([]).ok
-    monkeypatch.setattr(check, "checkpoint_folder", lambda *run: use_board / "nowhere")
-    report = run_check(read_records(use_board))
+def test_missing_checkpoint_and_empty_board_are_problems(board: Path, tmp_path: Path) -> None:
+    assert not run_check([], board).ok
+    report = run_check(read_records(board), tmp_path)
     assert not report.ok
     assert "does not ship" in report.problems[0]
 
@@ -431,11 +429,23 @@ def other_settings(record: ResultRecord) -> dict[str, Any]:
     return {"checkpoint": changed.model_copy(update={"config_hash": config.hash()})}
 
 
-def unknown_preset(record: ResultRecord) -> dict[str, Any]:
-    """On a board of its own."""
-    config = record.checkpoint.config.model_copy(update={"preset": "huge"})
-    described = {"config": config, "config_hash": RunConfig.from_json(config.model_dump()).hash()}
-    return {"preset": "huge", "checkpoint": record.checkpoint.model_copy(update=described)}
+def not_installed(record: ResultRecord, width: int | None = None) -> ResultRecord:
+    """What it would be of a model that only its author has, on the same board."""
+    stated = record.checkpoint.config.model_dump()
+    stated["model_name"] = "mine"
+    stated["model"] |= {} if width is None else {"width": width}
+    training = {key: value for key, value in stated["training"].items() if key not in ("minutes", "steps")}
+    content = json.dumps(stated | {"training": training}, sort_keys=True)
+    config = record.checkpoint.config.model_validate(stated)
+    changes = {"config": config, "config_hash": hashlib.sha256(content.encode()).hexdigest()}
+    changed = record.checkpoint.model_copy(update=changes)
+    return record.model_copy(update={"track": "test", "model": "mine", "checkpoint": changed})
+
+
+def another_seed(record: ResultRecord) -> ResultRecord:
+    """What training with another seed might end in."""
+    changed = record.checkpoint.model_copy(update={"seed": 1, "weights_sha256": "1" * 64})
+    return with_errors(record, 1, 1.01).model_copy(update={"checkpoint": changed})
 
 
 def longer(record: ResultRecord) -> dict[str, Any]:
@@ -497,11 +507,15 @@ def test_a_submission_is_taken(board: Path, submitted: ResultRecord, tmp_path: P
         (longer, "its budget is {'minutes': None, 'steps': 600}, but"),
         ({"materials": {"youngs_modulus": (10.0,)}}, "name them by a variant"),
         (checkpoint(materials={"youngs_modulus": (10.0,)}), "materials: {}, not {'youngs_modulus': (10.0,)}"),
-        (unknown_preset, "its settings are not those of preset 'huge'"),
+        ({"preset": "huge"}, "unknown preset 'huge'; known: compact"),
         (checkpoint(config_hash="0"), "config_hash: 0, not"),
         (training(optimizer="sgd"), "configuration: none of mgn"),
         (per_timestep(-1), "frames that errors are of"),
-        (checkpoint(steps=0), "steps: 0, but mgn learns"),
+        (checkpoint(steps=0, best_step=0), "steps: 0, but mgn learns"),
+        (checkpoint(steps=-1, best_step=-1), "best_step: -1, not one of -1 steps"),
+        ({"parameters": 0}, "steps: 3, but mgn has no parameters that could learn"),
+        (training(steps=None), "budget of its settings: steps None and minutes None"),
+        (training(weight_decay=None), "configuration: none of mgn"),
         (
             lambda record: longer(record) | {"variant": "long"},
             "its budget is {'minutes': None, 'steps': 600}, but",
@@ -518,6 +532,98 @@ def test_what_is_wrong_with_a_submission_is_named(
         changes = changes(submitted)
     verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
     assert any(reason in problem for problem in verdict.problems), verdict
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (checkpoint(), None),
+        (checkpoint(config_hash="0"), "config_hash: 0, not"),
+        (training(steps=600), "steps: 3, not the 600 of its settings"),
+        (training(steps=None, minutes=1e-9), "minutes: "),
+        (training(rate=1.0), "configuration: none of mine"),
+        (checkpoint(steps=0, best_step=0), "steps: 0, but mine learns"),
+        (checkpoint(best_step=4), "best_step: 4"),
+        ({"preset": "huge", "track": "theirs"}, "unknown preset 'huge'"),
+    ],
+)
+def test_what_needs_no_model_is_checked_without_it(
+    board: Path, submitted: ResultRecord, changes: Any, reason: str | None
+) -> None:
+    """As for one that is installed."""
+    honest = not_installed(submitted)
+    if callable(changes):
+        changes = changes(honest)
+    others = [record for record in read_records(board) if record.model != "mgn"]
+    problems = submission.review(honest.model_copy(update=changes), others).problems
+    assert len(problems) == (reason is not None), problems
+    assert all(str(reason) in problem for problem in problems)
+
+
+def test_hashes_can_be_derived_where_no_model_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From what records say, whatever there is in it."""
+    monkeypatch.setattr(consistency, "model_names", list)
+    assert check.check_statements(read_records()) == []
+
+
+def test_a_copied_seed_is_found(board: Path, submitted: ResultRecord) -> None:
+    """By its weights or by its errors, on whatever track; what does not learn is the same for every seed."""
+    records = read_records(board)
+    second = another_seed(submitted).model_copy(update={"track": "test"})
+    assert submission.review(second, records).problems == ()
+    same_errors = submitted.results
+    same_weights = second.checkpoint.model_copy(
+        update={"weights_sha256": submitted.checkpoint.weights_sha256}
+    )
+    for changes, reason in (
+        (
+            {"results": same_errors},
+            "its errors are, to the last digit, those of mgn-smoke-s0 in track 'test'",
+        ),
+        ({"checkpoint": same_weights}, "its weights are those of mgn-smoke-s0 in track 'test'"),
+    ):
+        for track in ("test", "theirs"):
+            copied = second.model_copy(update=changes | {"track": track})
+            (problem,) = submission.review(copied, records).problems
+            assert reason in problem
+    renamed = not_installed(submitted)
+    (problem,) = submission.review(renamed, records).problems
+    assert "its weights are those of mgn-smoke-s0" in problem
+    for allowed in (renamed, submitted):  # on another track
+        assert submission.review(allowed.model_copy(update={"track": "theirs"}), records).problems == ()
+    still = next(record for record in records if record.model == "stand_still")
+    seed = still.checkpoint.model_copy(update={"seed": 1})
+    again = still.model_copy(update={"seed": 1, "checkpoint": seed})
+    assert submission.review(again, records).problems == ()
+
+
+@pytest.mark.parametrize("width", [99, None])
+def test_a_submission_that_its_board_cannot_be_made_with_is_refused(
+    board: Path, submitted: ResultRecord, tmp_path: Path, width: int | None
+) -> None:
+    """One whose settings differ from its row's behind the same hash: by a value, or by what goes without saying."""
+    first = not_installed(submitted)
+    stated = not_installed(another_seed(submitted), width).checkpoint
+    if width is None:
+        training = {key: value for key, value in stated.config.training.items() if key != "weight_decay"}
+        stated = stated.model_copy(update={"config": stated.config.model_copy(update={"training": training})})
+    stated = stated.model_copy(update={"config_hash": first.checkpoint.config_hash})
+    second = not_installed(another_seed(submitted)).model_copy(update={"checkpoint": stated})
+    home = tmp_path / "home"
+    shutil.copytree(board / "records", home / "records", ignore=shutil.ignore_patterns("mgn-*"))
+    for one, code in ((first, 0), (second, 1)):
+        path = write_record(one, tmp_path / "theirs")
+        with pytest.raises(SystemExit) as stop:
+            run(["leaderboard", "submit", str(path), "--home", str(home)])
+        assert stop.value.code == code
+    (problem,) = submission.review(second, read_records(home)).problems
+    reason = (
+        "config_hash: "
+        if width
+        else "the board cannot be made with it: test/sheet_deformation: mine-smoke-s1"
+    )
+    assert problem.startswith(reason)
+    render.render(read_records(home))
 
 
 def test_where_it_was_trained_counts_where_budgets_are_minutes(board: Path, submitted: ResultRecord) -> None:
@@ -539,6 +645,9 @@ def test_where_it_was_trained_counts_where_budgets_are_minutes(board: Path, subm
         ({"variant": "x/../../evil"}, "variant"),
         ({"track": "../evil"}, "track"),
         ({"keys": ("test_00000",) * 4}, "twice"),
+        ({"evaluation_seconds": 0.0}, "evaluation_seconds"),
+        ({"evaluation_seconds": np.inf}, "evaluation_seconds"),
+        ({"parameters": -1}, "parameters"),
     ],
 )
 def test_records_that_cannot_be_are_refused(
@@ -573,7 +682,16 @@ def test_what_is_replaced_does_not_count(board: Path, submitted: ResultRecord) -
     new = new.model_copy(update={"checkpoint": new.checkpoint.model_copy(update={"steps": 600})})
     problems = submission.review(new, read_records(board)).problems
     assert any("its budget is" in problem for problem in problems)
-    assert submission.review(new, read_records(board), replace=True).problems == ()
+    kept = [one.model_copy(update={"ships": False}) for one in read_records(board)]
+    assert submission.review(new, kept, replace=True).problems == ()
+
+
+def test_what_ships_is_not_replaced_by_a_record_alone(board: Path, submitted: ResultRecord) -> None:
+    """Its checkpoint would be that of no record."""
+    new = submitted.model_copy(update={"track": "test"})
+    (problem,) = submission.review(new, read_records(board), replace=True).problems
+    assert "sheet_deformation/mgn-smoke-s0 ships with its checkpoint" in problem
+    assert "into checkpoints/sheet_deformation/mgn-smoke-s0 of the leaderboard" in problem
 
 
 def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecord) -> None:
@@ -586,7 +704,8 @@ def test_a_trial_is_taken_beside_trials_only(board: Path, submitted: ResultRecor
 
 
 def test_a_submission_on_other_bits_is_remarked(board: Path, submitted: ResultRecord) -> None:
-    other = submitted.model_copy(update={"trajectory_hashes": ("0" * 16, *submitted.trajectory_hashes[1:])})
+    hashes = ("0" * 16, *submitted.trajectory_hashes[1:])
+    other = another_seed(submitted).model_copy(update={"track": "test", "trajectory_hashes": hashes})
     verdict = submission.review(other, read_records(board))
     assert not verdict.problems
     (remark,) = verdict.remarks
@@ -600,7 +719,8 @@ def test_a_submission_on_other_bits_is_remarked(board: Path, submitted: ResultRe
         (checkpoint(dataset_hash="0"), "nothing on the board was trained on the same bits"),
         (checkpoint(minutes=1e3), "is its machine so much slower?"),
         (checkpoint(steps=10**6), "are its steps so much cheaper?"),
-        (checkpoint(device="cuda"), "are 3 steps a fair budget?"),
+        ({"track": "test", "parameters": 10**6}, "is that the size of preset 'smoke'?"),
+        ({}, "no track 'theirs' yet, so a new board begins with it; known: test"),
         (checkpoint(commit="c0ffee+changes"), "trained by code with changes that no commit holds"),
         ({"commit": "c0ffee+changes"}, "scored by code with changes that no commit holds"),
         ({"model": "theirs"}, "theirs is not installed here"),
@@ -613,6 +733,50 @@ def test_what_readers_of_a_submission_should_know_is_remarked(
         changes = changes(submitted)
     verdict = submission.review(submitted.model_copy(update=changes), read_records(board))
     assert any(reason in remark for remark in verdict.remarks), verdict
+
+
+def test_minutes_are_compared_on_one_device(board: Path, submitted: ResultRecord) -> None:
+    """Those of a CPU say nothing about those of a GPU, whatever else the board has."""
+
+    def trained(device: str, minutes: float, seed: int = 0) -> ResultRecord:
+        return submitted.model_copy(
+            update=checkpoint(device=device, minutes=minutes)(submitted) | {"seed": seed}
+        )
+
+    known = [trained("cpu", 10.0), trained("cuda", 0.5, seed=1)]
+    for device, minutes, is_long in (
+        ("cuda", 0.7, False),
+        ("cuda", 0.8, True),
+        ("cuda:1", 0.8, True),
+        ("cpu", 14.0, False),
+        ("cpu", 16.0, True),
+        ("mps", 99.0, False),
+    ):
+        remarks = str(submission.review(trained(device, minutes, seed=2), known).remarks)
+        assert ("is its machine so much slower?" in remarks) == is_long, (device, minutes)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_steps_of_a_model_that_the_board_does_not_have_are_stated(
+    board: Path, submitted: ResultRecord, device: str
+) -> None:
+    """Beside M3GN's, whatever trained the board's; those of a model that it has must be the same."""
+    peers = [record.model_copy(update=checkpoint(device=device)(record)) for record in read_records(board)]
+    m3gn = peers[0].model_copy(
+        update={"model": "m3gn", "checkpoint": peers[0].checkpoint.model_copy(update={"steps": 7})}
+    )
+    mine = not_installed(submitted)
+
+    def asked(record: ResultRecord, known: list[ResultRecord]) -> list[str]:
+        return [one for one in submission.review(record, known).remarks if "fair budget" in one]
+
+    assert asked(mine, peers) == [
+        "its board has no other mine: are 3 steps a fair budget beside the 3 at most of others?"
+    ]
+    assert asked(mine, [*peers, m3gn]) == [
+        "its board has no other mine: are 3 steps a fair budget beside the 7 of m3gn?"
+    ]
+    assert asked(mine, [*peers, m3gn, another_seed(mine)]) == []
 
 
 def test_a_submission_that_cannot_be_read_is_refused(
@@ -667,18 +831,16 @@ def test_a_record_is_not_replaced_by_accident(
         assert "name what differs with --variant" in " ".join(capsys.readouterr().err.split())
 
 
-def test_show_lists_what_is_on_record(
-    board: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_show_lists_what_is_on_record(board: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = read_records(board)
-    monkeypatch.setattr(record, "read_records", lambda: known)
+    show = ["leaderboard", "show", "--home", str(board)]
     for task, expected in (("sheet_deformation", known), ("deformable_block", [])):
         with pytest.raises(SystemExit):
-            run(["leaderboard", "show", "--task", task, "--json"])
+            run([*show, "--task", task, "--json"])
         shown = json.loads(capsys.readouterr().out)["records"]
         assert [ResultRecord.model_validate(one) for one in shown] == expected
     with pytest.raises(SystemExit):
-        run(["leaderboard", "show"])
+        run(show)
     rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
     numbers = {(model.strip(), int(context), float(mse)) for *_, model, _, _, _, context, mse, _ in rows}
     assert numbers == {

@@ -246,13 +246,69 @@ def column(site: Path, name: str) -> list[str]:
 
 
 def test_a_time_with_several_threads_is_left_out(tmp_path: Path) -> None:
-    times = []
-    for threads in (1, 2):
-        record = made_up("m3gn", 1.0).model_copy(update={"evaluation_threads": threads})
-        build(tmp_path, [record], ([], []), None)
-        times.append(column(tmp_path, "prediction [ms]"))
-    assert all(float(time) > 0 for time in times[0])
-    assert set(times[1]) == {""}
+    several = made_up("mgn", 2.0).model_copy(update={"evaluation_threads": 2})
+    build(tmp_path, [made_up("m3gn", 1.0), several], ([], []), None)
+    times = zip(column(tmp_path, "model"), column(tmp_path, "prediction [ms]"), strict=True)
+    assert {model: time != "" for model, time in times} == {"m3gn": True, "mgn": False}
+    build(tmp_path, [several], ([], []), None)
+    assert "prediction [ms]" not in (tmp_path / "index.html").read_text()
+
+
+def test_times_of_different_machines_are_apart(tmp_path: Path) -> None:
+    """For they cannot be compared."""
+    records = [
+        made_up("m3gn", 1.0, seed=seed).model_copy(update={"machine": machine, "evaluation_seconds": seconds})
+        for seed, machine, seconds in ((0, "slow", 3.0), (1, "fast", 1.0), (2, "fast", 2.0))
+    ]
+    build(tmp_path, [*records, made_up("mgn", 2.0).model_copy(update={"machine": "slow"})], ([], []), None)
+    predictions = len(records[0].keys) * len(records[0].results)
+    models = column(tmp_path, "model")
+    for machine, expected in (("slow", {"m3gn": 3.0, "mgn": 1.0}), ("fast", {"m3gn": 1.0, "mgn": None})):
+        times = column(tmp_path, f"prediction [ms], {machine}")
+        for model, time in zip(models, times, strict=True):
+            seconds = expected[model]
+            assert time == ("" if seconds is None else f"{1e3 * seconds / predictions:.3g}")
+
+
+def test_the_device_of_training_is_named(tmp_path: Path) -> None:
+    """Minutes of a GPU are others; what does not learn takes none of any."""
+    records = []
+    for model, device, minutes in (("mgn", "cuda", 0.5), ("m3gn", "cpu", 9.0), ("stand_still", "cuda", 0.0)):
+        record = made_up(model, 1.0)
+        trained = record.checkpoint.model_copy(update={"device": device, "minutes": minutes})
+        records.append(record.model_copy(update={"checkpoint": trained}))
+    build(tmp_path, records, ([], []), None)
+    shown = dict(zip(column(tmp_path, "model"), column(tmp_path, "training [min]"), strict=True))
+    assert shown == {"mgn": "0.5 of cuda", "m3gn": "9", "stand_still": "0"}
+
+
+def test_what_is_of_some_materials_is_apart(tmp_path: Path) -> None:
+    """Nor ranked with the others, whatever its errors."""
+    materials = {"youngs_modulus": (10.0,)}
+    some = [
+        made_up("m3gn", 0.5, variant="soft", keys=("test_00000", "test_00001")),
+        made_up("mgn", 5.0, variant="soft", keys=("test_00000", "test_00001", "test_00002")),
+    ]
+    records = [*(one.model_copy(update={"materials": materials}) for one in some)]
+    records += [made_up("mgn", 2.0), made_up("m3gn", 1.0)]
+    rows = [row for row in board_rows(records) if row.context == 5]
+    assert [(row.entry.label, row.part) for row in rows] == [
+        ("m3gn", ""),
+        ("mgn", ""),
+        ("m3gn (soft)", ", some materials"),
+        ("mgn (soft)", ", some materials"),
+    ]
+    for ends in (rows[:2], rows[2:]):
+        low, _, high = zip(*(row.places for row in ends), strict=True)
+        assert (min(low), max(high)) == pytest.approx((0, 100))
+    build(tmp_path, records, ([], []), None)
+    page = Elements(tmp_path / "index.html")
+    options = [text for a, text in page.of("option") if a["value"].startswith("sheet_deformation")]
+    assert options == ["Sheet Deformation", "Sheet Deformation, some materials"]
+    assert column(tmp_path, "task") == [name for name in options for _ in range(6)]
+    about = [" ".join(text.split()) for a, text in page.of("li") if "data-task" in a]
+    for text, name, number in zip(about, options, (len(records[2].keys), "2 or 3"), strict=True):
+        assert text.startswith(f"{name}, track compact: {number} test trajectories of tier paper")
 
 
 def test_records_of_a_task_that_is_not_installed_are_shown(tmp_path: Path) -> None:
@@ -409,6 +465,16 @@ def test_every_shipped_checkpoint_can_be_watched(home: Path, tmp_path: Path) -> 
     build(tmp_path, [record], ([], []), [Rollouts(TASK, labels, ())])
     assert column(tmp_path, "rollouts") == ["watch"] * 3
     assert f"rollouts.html#{TASK.name}/m3gn-smoke-s0/5" in (tmp_path / "index.html").read_text()
+
+
+def test_pictures_are_of_the_board_that_is_named(home: Path, smoke_file: Path, tmp_path: Path) -> None:
+    """With its own checkpoints, of whatever preset."""
+    options = ["--home", home, "-o", tmp_path, "--tier", "smoke", "--data", smoke_file.parent, "--json"]
+    result = CliRunner().invoke(cli, ["leaderboard", "pictures", *map(str, options)])
+    assert result.exit_code == 0, result.output
+    files = [tmp_path / f"{kind}-sheet_deformation.png" for kind in ("overlay", "latent")]
+    assert json.loads(result.stdout)["files"] == [str(file) for file in files]
+    assert all(file.stat().st_size for file in files)
 
 
 def test_numbers_are_packed() -> None:

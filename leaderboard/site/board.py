@@ -9,6 +9,7 @@ from m3gn_bench.leaderboard.render import tracks_of
 from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_below, titles
 
 TINY = 1e-30  # an error of zero has no place on a logarithmic scale
+SOME = ", some materials"  # whose errors cannot be compared with those of all trajectories
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Row:
         mse_free_nodes: mean over free nodes only.
         probability: that its mean error is lower than M3GN's; None where that cannot be said.
         places: of the interval's lower end, the mean and the upper end, on a logarithmic scale over all rows of the
-            same task, track and context size [%].
+            same track, task, part and context size [%].
     """
 
     track: str
@@ -34,14 +35,20 @@ class Row:
     probability: float | None
     places: tuple[float, float, float] = (50.0, 50.0, 50.0)
 
+    @property
+    def part(self) -> str:
+        """What follows the task's name where trajectories are restricted to some materials."""
+        return SOME if self.entry.records[0].materials else ""
+
 
 @dataclass(frozen=True)
 class Group:
-    """What the rows of a track and task have in common."""
+    """What the rows of a track, task and part have in common."""
 
     track: str
     task: str
-    trajectories: int
+    part: str
+    trajectories: tuple[int, ...]
     split: str
     tier: str
     versions: tuple[str, ...]
@@ -55,7 +62,7 @@ def digits(value: float) -> str:
 def board_rows(
     records: Sequence[ResultRecord], on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> list[Row]:
-    """All rows: by track, task and context size, and the lowest error first.
+    """All rows: by track, task, part and context size, and the lowest error first.
 
     Args:
         records: what to show.
@@ -65,30 +72,40 @@ def board_rows(
     result: list[Row] = []
     for done, (track, task) in enumerate(boards, 1):
         found = entries(records, track, task)
-        m3gn = next((entry for entry in found if entry.label == "m3gn"), None)
-        for context in sorted({context for entry in found for context in entry.contexts}):
-            rows = [_row(track, task, context, e, m3gn) for e in found if context in e.contexts]
-            result += _placed(sorted(rows, key=lambda row: row.mse.mean))
+        whole = [entry for entry in found if not entry.records[0].materials]
+        for part in (whole, [entry for entry in found if entry not in whole]):
+            result += _ranked(track, task, part)
         on_progress(done, len(boards))
     return result
 
 
 def groups_of(rows: Sequence[Row]) -> list[Group]:
-    """What trajectories the rows of every track and task are about."""
-    found: dict[tuple[str, str], list[ResultRecord]] = {}
+    """What trajectories the rows of every track, task and part are about."""
+    found: dict[tuple[str, str, str], list[ResultRecord]] = {}
     for row in rows:
-        found.setdefault((row.track, row.task), []).extend(row.entry.records)
+        found.setdefault((row.track, row.task, row.part), []).extend(row.entry.records)
     return [
         Group(
             track=track,
             task=task,
-            trajectories=max(len(record.keys) for record in records),
+            part=part,
+            trajectories=tuple(sorted({len(record.keys) for record in records})),
             split=records[0].split,
             tier=records[0].tier,
             versions=tuple(sorted({record.dataset_version for record in records})),
         )
-        for (track, task), records in found.items()
+        for (track, task, part), records in found.items()
     ]
+
+
+def _ranked(track: str, task: str, part: Sequence[Entry]) -> list[Row]:
+    """The rows of what can be compared."""
+    m3gn = next((entry for entry in part if entry.label == "m3gn"), None)
+    result: list[Row] = []
+    for context in sorted({context for entry in part for context in entry.contexts}):
+        rows = [_row(track, task, context, e, m3gn) for e in part if context in e.contexts]
+        result += _placed(sorted(rows, key=lambda row: row.mse.mean))
+    return result
 
 
 def _row(track: str, task: str, context: int, entry: Entry, m3gn: Entry | None) -> Row:

@@ -13,7 +13,7 @@ from m3gn_bench.leaderboard.claims import render_claims
 from m3gn_bench.leaderboard.figures import draw_board
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.render import TRACKS, tracks_of
-from m3gn_bench.leaderboard.site.board import board_rows, digits, groups_of
+from m3gn_bench.leaderboard.site.board import SOME, board_rows, digits, groups_of
 from m3gn_bench.leaderboard.site.markdown import Page, to_line, to_page
 from m3gn_bench.leaderboard.site.rollouts import Rollouts
 from m3gn_bench.leaderboard.summary import middle, titles
@@ -120,11 +120,18 @@ def _leaderboard(
     rows = board_rows(records, on_progress)
     contexts: dict[str, set[int]] = {}
     for row in rows:
-        contexts.setdefault(row.task, set()).add(row.context)
+        contexts.setdefault(row.task + row.part, set()).add(row.context)
     site.page(
         "index.html",
         "leaderboard.html",
         rows=rows,
+        boards={
+            name + part: title + part
+            for name, title in titles(records).items()
+            for part in ("", SOME)
+            if name + part in contexts
+        },
+        machines=sorted({machine for row in rows for machine in row.entry.seconds_per_prediction}),
         groups=groups_of(rows),
         tracks={name: to_line(TRACKS.get(name, "")) for name in tracks_of(records)},
         contexts=sorted({row.context for row in rows}),
