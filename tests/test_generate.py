@@ -70,9 +70,8 @@ class FakeScene:
             raise SolverError(reason)
         rest = np.eye(4, 3, dtype=np.float32)[::-1].copy()
         mesh = Mesh(rest, np.array([[0, 3, 2, 1]], np.int32), VTK_TETRA, np.full(4, FREE, np.uint8))
-        return Trajectory(
-            np.repeat(rest[None], self.frames, 0) + np.float32(parameter), mesh, {"draw": parameter}
-        )
+        moved = np.arange(1, self.frames + 1, dtype=np.float32) * np.float32(parameter)
+        return Trajectory(rest + moved[:, None, None], mesh, {"draw": parameter})
 
     def check(self, trajectory: Trajectory) -> list[str]:
         reason = self.reason(trajectory.material["draw"])
