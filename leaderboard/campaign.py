@@ -53,7 +53,6 @@ from m3gn_bench.tasks import get_task
 from m3gn_bench.training import require_budget, train
 from m3gn_bench.version import __version__
 
-PLANS = Path(__file__).parent / "plans"
 State = Literal["done", "outdated", "to do"]
 
 

@@ -12,13 +12,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from m3gn_bench.checkpoint import Checkpoint
+from m3gn_bench.checkpoint import Checkpoint, is_of_preset
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.errors import ConfigError
-from m3gn_bench.model import load_preset
-from m3gn_bench.tasks import get_task
 
-PACE = Path(__file__).parent / "plans" / "pace.jsonl"  # of the models of this package
+PLANS = Path(__file__).parent / "plans"
+PACE = PLANS / "pace.jsonl"  # of the models of this package
 
 
 class Measured(Record):
@@ -86,9 +85,7 @@ def training_seconds(description: Checkpoint) -> float | None:
     """
     named = description.config
     try:
-        steps = {"training.steps": named.training.get("steps")}
-        usual = load_preset(named.model_name, named.preset, get_task(description.task), steps)
-        if usual.hash() == description.config_hash:
+        if is_of_preset(description):
             pace = read_pace(PACE).per_minute(named.preset, description.task, named.model_name)
             return 60 * description.steps / pace
     except ConfigError:  # no such preset, or no pace

@@ -4,7 +4,15 @@ from collections.abc import Collection, Iterable, Sequence
 
 from m3gn_bench.leaderboard.figures import STYLES
 from m3gn_bench.leaderboard.record import ResultRecord
-from m3gn_bench.leaderboard.summary import Entry, entries, middle, probability_below, titles
+from m3gn_bench.leaderboard.summary import (
+    SOME,
+    Entry,
+    by_materials,
+    entries,
+    middle,
+    probability_below,
+    titles,
+)
 
 FIGURES = "figures"  # the folder beside the page
 PICTURES = {
@@ -66,11 +74,9 @@ def render(records: Sequence[ResultRecord], pictures: Collection[str] = ()) -> s
         parts.append(f"## Track: {track}\n\n{TRACKS.get(track, '')}\n")
         for name, task_title in titles(records).items():
             rows = entries(records, track, name)
-            whole = [row for row in rows if not row.records[0].materials]
-            if len(whole) < len(rows):  # not comparable with the others, and a table of their own
-                parts.append(
-                    _task_table(f"{task_title}, some materials", [r for r in rows if r not in whole])
-                )
+            whole, some = by_materials(rows)
+            if some:
+                parts.append(_task_table(task_title + SOME, some))
             if whole:
                 parts.append(_task_table(task_title, whole))
                 if track == "compact" and any(row.label in STYLES for row in rows):

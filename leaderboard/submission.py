@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from m3gn_bench.checkpoint import is_of_preset
 from m3gn_bench.datasets.errors import BenchError
 from m3gn_bench.datasets.schema import IMPORTED, Record
 from m3gn_bench.errors import ConfigError
 from m3gn_bench.leaderboard.consistency import contradictions
 from m3gn_bench.leaderboard.record import RECORD_SCHEMA, ResultRecord, checkpoint_folder, find_record
 from m3gn_bench.leaderboard.summary import entries
-from m3gn_bench.model import load_preset, model_names
-from m3gn_bench.tasks import get_task
+from m3gn_bench.model import model_names
 from m3gn_bench.version import __version__
 
 LONG = 1.5  # times as long as all others of a board; machines differ, too
@@ -116,10 +116,9 @@ def _compared_data(record: ResultRecord, board: Sequence[ResultRecord]) -> Verdi
 
 def _is_of_preset(record: ResultRecord) -> bool:
     try:
-        usual = load_preset(record.model, record.preset, get_task(record.task))
+        return is_of_preset(record.checkpoint)
     except ConfigError:  # no such preset
         return False
-    return record.checkpoint.config_hash == usual.hash()
 
 
 def _without_checkpoint(taken: ResultRecord) -> str:

@@ -11,6 +11,7 @@ from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.metrics import bootstrap_means
 from m3gn_bench.tasks import TASKS
 
+SOME = ", some materials"  # after the name of a task
 SEEDS = 3  # fewer say too little of what another seed would give
 
 
@@ -184,6 +185,12 @@ def entries(records: Sequence[ResultRecord], track: str, task: str) -> list[Entr
             row.append(record)
     found = [Entry(tuple(sorted(group, key=lambda r: r.seed))) for group in groups.values()]
     return sorted(found, key=lambda entry: float(entry.errors(middle(entry.contexts)).mean()))
+
+
+def by_materials(rows: Sequence[Entry]) -> tuple[list[Entry], list[Entry]]:
+    """Rows of all trajectories, and of some materials only, whose errors cannot be compared with the others."""
+    some = [row for row in rows if row.records[0].materials]
+    return [row for row in rows if row not in some], some
 
 
 def _belongs(record: ResultRecord) -> tuple[object, ...]:

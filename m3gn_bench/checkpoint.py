@@ -18,7 +18,7 @@ from m3gn_bench.datasets.errors import first_problem
 from m3gn_bench.datasets.schema import Record
 from m3gn_bench.datasets.writer import write_bytes_atomically
 from m3gn_bench.errors import CheckpointError
-from m3gn_bench.model import Model, RunConfig, build_model
+from m3gn_bench.model import Model, RunConfig, build_model, load_preset
 from m3gn_bench.tasks import Task, get_task
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "checkpoint.json"
@@ -88,6 +88,13 @@ def read_description(folder: Path) -> Checkpoint:
         return Checkpoint.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise CheckpointError(f"{path} is damaged: {first_problem(error)}") from error
+
+
+def is_of_preset(description: Checkpoint) -> bool:
+    """Whether its settings, but for the budget, are its preset's. Raises ConfigError if there is no such preset."""
+    config = description.config
+    usual = load_preset(config.model_name, config.preset, get_task(description.task))
+    return description.config_hash == usual.hash()
 
 
 def load_checkpoint(folder: Path, task: Task | None = None) -> tuple[Model, Checkpoint]:

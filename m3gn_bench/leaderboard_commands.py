@@ -217,7 +217,7 @@ def check_command(
     its plan smoke, if it has one, which are trained again.
     """
     from m3gn_bench.cpu import use_cpu
-    from m3gn_bench.leaderboard.campaign import PLANS, read_plan
+    from m3gn_bench.leaderboard.campaign import read_plan
     from m3gn_bench.leaderboard.check import (
         TOLERANCES,
         CheckReport,
@@ -244,8 +244,7 @@ def check_command(
             sampled, trajectories=trajectories, offset=rounds, home=folder, on_progress=on_progress
         )
     compared, problems = list(found.compared), [*check_statements(records), *found.problems]
-    plans = PLANS if home is None else home / "plans"
-    plan = plans / "smoke.toml"
+    plan = folder / "plans" / "smoke.toml"
     if retrain and (home is None or plan.is_file()):  # another board need not have one
         planned = [run for run in read_plan(plan) if task_name in (None, run.task)]
         with report.progress("training again") as on_progress:
@@ -278,7 +277,7 @@ def check_command(
         unseen = len(shipped) - runs([c for c in outcome.compared if c.kind == "shipped checkpoint"])
         lines.append(
             f"{left} records were not looked at: {unseen} are sampled by other values of --offset, the others can only "
-            f"be re-derived by training (see the plans in {plans})"
+            f"be re-derived by training (see the plans in {plan.parent})"
         )
     if not outcome.compared and not outcome.problems:
         lines.append("there is nothing to compare: no record has a checkpoint here, or is of track smoke")

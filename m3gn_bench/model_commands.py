@@ -394,11 +394,9 @@ def evaluate(
 
 def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: str, variant: str) -> None:
     """Raises ConfigError if a record would replace another, or pass for one of the model's preset and is not."""
-    from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.checkpoint import is_of_preset, read_description
     from m3gn_bench.errors import ConfigError
     from m3gn_bench.leaderboard.record import find_record, run_name
-    from m3gn_bench.model import load_preset
-    from m3gn_bench.tasks import get_task
 
     found = read_description(folder)
     config = found.config
@@ -408,8 +406,8 @@ def _require_recordable(folder: Path, board: "Sequence[ResultRecord]", track: st
             f"there is a record of {found.task}/{name} on track {track!r} already; give --replace to replace it, or "
             "another --track"
         )
-    usual = load_preset(config.model_name, config.preset, get_task(found.task))
-    if not variant and (found.materials or found.config_hash != usual.hash()):
+    of_preset = is_of_preset(found)  # refuses a preset that there is not, whatever the variant
+    if not variant and (found.materials or not of_preset):
         raise ConfigError(
             f"{folder} was trained with other settings than preset {config.preset!r} has, or on some materials only; "
             "name what differs with --variant"

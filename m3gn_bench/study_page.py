@@ -46,9 +46,9 @@ between the ratios of times there, so that the machine's noise does not decide; 
 is a factor of {EXTRAPOLATED_MARGIN:g}. *By parts* a setting lies on the front if no other is better when errors of
 steps and of the mesh count each for itself: a coarse mesh is another body, the same in all trajectories, while steps
 and tolerances add noise to its motion; so the default fidelity solves its mesh better than the total error asks for. A
-model **pays off** after so many trajectories as make its training (its steps at the
-pace of one core of the machine that the leaderboard's plans name) cheaper than the fastest simulator setting that is at
-least as accurate on the frames after the context; in parentheses, with the simulation of its training data.
+model **pays off** after so many trajectories as make its training (its steps at the pace of one core of the machine
+that the leaderboard's plans name) cheaper than the fastest simulator setting that is at least as accurate on the frames
+after the context; in parentheses, with the simulation of its training data.
 """
 
 STABILITY_HEADER = """## Stability

@@ -17,8 +17,9 @@ from scipy.stats import gmean
 from m3gn_bench.checkpoint import load_checkpoint
 from m3gn_bench.cli import run
 from m3gn_bench.errors import ConfigError
-from m3gn_bench.leaderboard.campaign import PLANS, Job, Outcome, carry_out, read_plan
+from m3gn_bench.leaderboard.campaign import Job, Outcome, carry_out, read_plan
 from m3gn_bench.leaderboard.check import compare_with_retrained
+from m3gn_bench.leaderboard.pace import PLANS
 from m3gn_bench.leaderboard.record import ResultRecord, checkpoint_folder, read_records
 from m3gn_bench.m3gn import M3GN
 from m3gn_bench.model import load_preset

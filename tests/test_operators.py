@@ -173,7 +173,8 @@ def test_egno_does_not_turn_if_vectors_are_read_as_scalars(kind: str) -> None:
 
 def test_what_neighbours_move_a_node_by_is_limited() -> None:
     """One far node alone threw out its neighbours by hundreds of standard deviations, layer by layer."""
-    case, model = make_case("falling_teddy", 3), build("egno", "falling_teddy", training_cases("falling_teddy"))
+    kind = "falling_teddy"
+    case, model = make_case(kind, 3), build("egno", kind, training_cases(kind))
     assert isinstance(model, EGNO)
     found = []
     for scalar in (1e4, 1e6):

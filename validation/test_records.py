@@ -4,7 +4,6 @@
 the board's curves are drawn from, take all of the test split.
 """
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +30,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("data")
 
 
-@cache
-def _test_split(name: str, folder: Path) -> Path:
-    return find_or_generate(get_task(name), "paper", folder, splits=("test",))
-
-
 @pytest.mark.parametrize(("name", "model"), [(task, model) for task in MODELS for model in MODELS[task]])
 def test_every_number_of_a_record(folder: Path, name: str, model: str) -> None:
     """Errors of trajectories within what other processors may round to, and so their means over time."""
     checkpoint = checkpoint_folder(name, model, "compact")
-    made = score(checkpoint, _test_split(name, folder), track="compact", tier="paper")
+    dataset = find_or_generate(get_task(name), "paper", folder, splits=("test",))
+    made = score(checkpoint, dataset, track="compact", tier="paper")
     recorded = find_record(read_records(), "compact", name, made.name)
     assert recorded is not None
     assert made.keys == recorded.keys

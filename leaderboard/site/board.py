@@ -6,10 +6,17 @@ from dataclasses import dataclass
 
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.render import tracks_of
-from m3gn_bench.leaderboard.summary import Entry, Estimate, entries, probability_below, titles
+from m3gn_bench.leaderboard.summary import (
+    SOME,
+    Entry,
+    Estimate,
+    by_materials,
+    entries,
+    probability_below,
+    titles,
+)
 
 TINY = 1e-30  # an error of zero has no place on a logarithmic scale
-SOME = ", some materials"  # whose errors cannot be compared with those of all trajectories
 
 
 @dataclass(frozen=True)
@@ -71,9 +78,7 @@ def board_rows(
     boards = [(track, task) for track in tracks_of(records) for task in titles(records)]
     result: list[Row] = []
     for done, (track, task) in enumerate(boards, 1):
-        found = entries(records, track, task)
-        whole = [entry for entry in found if not entry.records[0].materials]
-        for part in (whole, [entry for entry in found if entry not in whole]):
+        for part in by_materials(entries(records, track, task)):
             result += _ranked(track, task, part)
         on_progress(done, len(boards))
     return result

@@ -13,10 +13,10 @@ from m3gn_bench.leaderboard.claims import render_claims
 from m3gn_bench.leaderboard.figures import draw_board
 from m3gn_bench.leaderboard.record import ResultRecord
 from m3gn_bench.leaderboard.render import TRACKS, tracks_of
-from m3gn_bench.leaderboard.site.board import SOME, board_rows, digits, groups_of
+from m3gn_bench.leaderboard.site.board import board_rows, digits, groups_of
 from m3gn_bench.leaderboard.site.markdown import Page, to_line, to_page
 from m3gn_bench.leaderboard.site.rollouts import Rollouts
-from m3gn_bench.leaderboard.summary import middle, titles
+from m3gn_bench.leaderboard.summary import SOME, middle, titles
 from m3gn_bench.stability import Stability
 from m3gn_bench.study_page import draw, render
 from m3gn_bench.tradeoff import TradeOff
