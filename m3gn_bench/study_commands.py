@@ -78,6 +78,7 @@ def tradeoff(
 
     Takes some minutes; an interrupted run goes on where it stopped.
     """
+    from m3gn_bench.datasets.writer import require_writable
     from m3gn_bench.figures import require_drawable, save
     from m3gn_bench.generators.knobs import knobs_of
     from m3gn_bench.study_page import advice, draw
@@ -90,6 +91,9 @@ def tradeoff(
     shipped = _checkpoints(task, folders)
     if output is not None:
         require_drawable(output)
+        require_writable(output.parent)
+    if record_home is not None:
+        require_writable(record_home)
     _alone(data)
     with report.progress(f"measuring {task.name}") as on_progress:
         result, study = measure(
@@ -166,6 +170,7 @@ def stability(
     an interrupted run goes on where it stopped.
     """
     from m3gn_bench.checkpoint import read_description
+    from m3gn_bench.datasets.writer import require_writable
     from m3gn_bench.generators.extremes import extremes_of, has_extremes
     from m3gn_bench.stability import measure
     from m3gn_bench.tasks import TASKS, get_task
@@ -178,6 +183,8 @@ def stability(
     else:
         tasks = [task for task in TASKS.values() if has_extremes(task.scene)]
     chosen = [(task, extremes_of(task.scene), _checkpoints(task, folders)) for task in tasks]
+    if record_home is not None:
+        require_writable(record_home)
     _alone(data)
     results, studies = [], []
     for task, grid, shipped in chosen:

@@ -145,19 +145,19 @@ def test_of_several_machines_the_one_that_says_least_decides(monkeypatch: pytest
             rows(2, a=1.0, b=1.0), ["one", "two"] * 2, [1.0, 1.0, 4.0, 1.2], strict=True
         )
     ]
-    faster = below("a", "b", of_time=True)
+    faster = below("a", "b", time="faster")
     assert verdict_of(monkeypatch, records, faster) == "undecided"
-    assert verdict_of(monkeypatch, records, below("b", "a", of_time=True)) == "not reproduced"
-    assert verdict_of(monkeypatch, records, below("a", "b", of_time=True, margin=0.1)) == "reproduced"
-    assert verdict_of(monkeypatch, records, below("b", "a", of_time=True, margin=0.1)) == "not reproduced"
+    assert verdict_of(monkeypatch, records, below("b", "a", time="faster")) == "not reproduced"
+    assert verdict_of(monkeypatch, records, below("a", "b", time="no slower")) == "reproduced"
+    assert verdict_of(monkeypatch, records, below("b", "a", time="no slower")) == "not reproduced"
 
 
 def test_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     records = rows(a=1.0, b=1.0)
     slow = [r.model_copy(update={"evaluation_seconds": 2.0}) if r.model == "b" else r for r in records]
-    faster = below("a", "b", of_time=True)
+    faster = below("a", "b", time="faster")
     assert verdict_of(monkeypatch, slow, faster) == "reproduced"
-    assert verdict_of(monkeypatch, slow, below("b", "a", of_time=True)) == "not reproduced"
+    assert verdict_of(monkeypatch, slow, below("b", "a", time="faster")) == "not reproduced"
     assert verdict_of(monkeypatch, records, faster) == "undecided"
     elsewhere = [r.model_copy(update={"machine": "another"}) if r.model == "b" else r for r in slow]
     assert verdict_of(monkeypatch, elsewhere, faster) == "not measured yet"

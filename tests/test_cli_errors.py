@@ -402,7 +402,9 @@ def test_where_nothing_can_be_written_nothing_is_simulated(
     (tmp_path / "file").touch()
     below, data = tmp_path / "file" / "folder", ["--data", tmp_path / "data"]
     evaluate = [*EVALUATE, "--checkpoint", trained, "--record", below, "--variant", "short"]
-    for arguments in ([*TRAIN[:-1], below, "--steps", 2], evaluate):
+    studies = [[study, "sheet_deformation", "--record", below] for study in ("tradeoff", "stability")]
+    figure = ["tradeoff", "sheet_deformation", "--output", below / "figure.svg"]
+    for arguments in ([*TRAIN[:-1], below, "--steps", 2], evaluate, *studies, figure):
         assert_one_line(command(*arguments, *data), "cannot write to", "folder", "Not a directory")
         assert not (tmp_path / "data").exists()
 
