@@ -149,8 +149,7 @@ NOISY = tuple(f"m3gn_noise_{level}" for level in ("5e-4", "1e-3"))
 MATERIALS = ("10", "60", "180", "500", "1000")
 THROWN = (
     "EGNO's place on Mixed Objects Falling at context 20 is that of one trajectory, whose prediction diverges with "
-    "every seed, up to a limit that the authors' code has, too ([experiments](../docs/performance.md)). Records of "
-    "seeds 1 and 2 are from before EGNO had this limit here."
+    "every seed, up to a limit that the authors' code has, too ([experiments](../docs/performance.md))."
 )
 PAIRS = (
     "Training steps of M3GN read one or two pairs of context frames, those of the neural processes two, and "
