@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from model_cases import make_case, training_cases
 from primitives_fit import fit_error
 from rigid_errors import PARTS, rigid_parts
 from scipy.spatial.transform import Rotation
+from step_errors import path
 from toppling import level_paths, regression
 from training_step import loss, pair_of_models, time_steps
 from usual_m3gn import PlainM3GN
@@ -21,6 +23,7 @@ from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.leaderboard.pace import read_pace
 from m3gn_bench.m3gn import M3GN
+from m3gn_bench.model import build_model, load_preset
 from m3gn_bench.movement_primitives import ProDMP
 from m3gn_bench.tasks import get_task
 
@@ -102,6 +105,30 @@ def test_fitted_primitives_find_what_primitives_made(context: int) -> None:
     noise = 0.1 * torch.randn(made.shape, generator=generator)
     left = (steps - functions - 1) / steps * float(noise.square().mean())
     assert error(made + noise) == pytest.approx(left, rel=0.1)
+
+
+@pytest.mark.parametrize("context", [2, 5])
+@pytest.mark.parametrize("kind", WITHOUT_AND_WITH_COLLIDER)
+def test_steps_from_a_models_own_state_are_its_rollout_and_from_the_true_one_are_single(
+    kind: str, context: int
+) -> None:
+    task, case = get_task(kind), make_case(kind, 3)
+    model = build_model(load_preset("mgn", "smoke", task), task, seed=1)
+    with torch.inference_mode():
+        rollout, single, true_positions, true_movements = (
+            path(model, case, context, *true)
+            for true in ((False, False), (True, True), (True, False), (False, True))
+        )
+        assert torch.equal(rollout, model.predict(case.context(context)))
+        steps = [
+            model.predict(case.context(seen))[0] - case.positions[seen - 1]
+            for seen in range(context, case.frames)
+        ]
+    expected = case.positions[context - 1] + torch.stack(steps).cumsum(0)
+    assert float((single - expected).abs().max()) < 1e-5
+    made = (rollout, single, true_positions, true_movements)
+    assert all(torch.equal(a[0], rollout[0]) for a in made)
+    assert all(not torch.allclose(a[1], b[1]) for a, b in combinations(made, 2))
 
 
 def test_rigid_errors_are_told_apart() -> None:
