@@ -28,6 +28,7 @@ from m3gn_bench.generators.knobs import Knobs, Setting, knobs_of
 from m3gn_bench.generators.scene import get_scene, scene_names
 from m3gn_bench.generators.sheet_deformation import SheetDeformation
 from m3gn_bench.generators.workers import run_jobs
+from m3gn_bench.leaderboard import record
 from m3gn_bench.leaderboard.pace import training_seconds
 from m3gn_bench.leaderboard.record import checkpoint_folder
 from m3gn_bench.model import model_names
@@ -294,9 +295,12 @@ def test_commands_measure_record_and_render(tmp_path: Path, monkeypatch: pytest.
     assert result == result.with_front()
     assert found == result.model_dump(mode="json")
     assert_sound(result)
+    # Two of the models that ship, and one that has learned nothing and is left out.
+    monkeypatch.setattr(record, "shipped_models", lambda task: ["m3gn", "egno", "stand_still"])
     code, found = run("stability", "deformable_block", *places)
+    assert {c["subject"] for c in found["tasks"][0]["cells"]} == {"simulator", "m3gn", "egno"}
     wrong = [(c["subject"], c["cell"]) for c in found["tasks"][0]["cells"] if c["verdict"] == "wrong"]
-    # EGNO's messages read squared distances; all else that ships is bounded.
+    # EGNO's messages read squared distances.
     assert wrong == [("egno", "ten times the size")]
     assert (code, found["wrong"]) == (1, 1)
     assert not list(tmp_path.glob("*.partial"))
@@ -307,8 +311,8 @@ def test_commands_measure_record_and_render(tmp_path: Path, monkeypatch: pytest.
     sha = read_description(M3GN.folder).weights_sha256
     assert page.count(f"SHA-256 of the models' weights: m3gn {sha[:8]}") == 1
     assert run("render-studies", str(docs), "--check")[0] == 0
-    record = docs / "studies" / f"tradeoff-{TASK.name}.json"
-    record.write_text(record.read_text().replace("displacement", "size"))
+    recorded = docs / "studies" / f"tradeoff-{TASK.name}.json"
+    recorded.write_text(recorded.read_text().replace("displacement", "size"))
     assert run("render-studies", str(docs), "--check")[0] == 1
     with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
         save(draw(result), tmp_path / "figure.xyz")
