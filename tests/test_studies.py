@@ -314,16 +314,16 @@ def test_commands_measure_record_and_render(tmp_path: Path, monkeypatch: pytest.
     recorded = docs / "studies" / f"tradeoff-{TASK.name}.json"
     recorded.write_text(recorded.read_text().replace("displacement", "size"))
     assert run("render-studies", str(docs), "--check")[0] == 1
-    with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
-        save(draw(result), tmp_path / "figure.xyz")
 
     # A figure has room for all models that there are.
     (one, *_) = result.models
     many = tuple(one.model_copy(update={"model": name}) for name in model_names())
-    legend = draw(result.model_copy(update={"models": many})).legends[0]
+    drawn = draw(result.model_copy(update={"models": many}))
     assert {f"{name}, by context" for name in model_names()} <= {
-        text.get_text() for text in legend.get_texts()
+        text.get_text() for text in drawn.legends[0].get_texts()
     }
+    with pytest.raises(ConfigError, match="unknown picture format 'xyz'"):
+        save(drawn, tmp_path / "figure.xyz")
 
     # Without the libraries for figures, nothing is written by half.
     (docs / "tradeoff.md").write_text("as it was")
