@@ -40,7 +40,7 @@ TRACKS = {
     "core of the machine that [pace.jsonl](plans/pace.jsonl) names ([plan](plans/compact.toml)). *Training* says how "
     "many minutes of one core they took, mean over the seeds that a CPU trained; where there are none, minutes of the "
     "device that is named (the steps are the same anywhere). *By the clock*: the budget was minutes of that machine.",
-    "ablations": "The paper's ablations, half that time ([plan](plans/ablations.toml)).",
+    "ablations": "The paper's ablations, half that time unless a row says otherwise ([plan](plans/ablations.toml)).",
     "paper": "Networks of the paper's size, each for the steps that it makes in half an hour of one core, validated "
     "ten times on 18 trajectories ([plan](plans/paper.toml)). This is not the paper's training, which took days on a "
     "GPU; its learning rates are kept (1e-5 for M3GN on Sheet Deformation, which is low for so short a time).",
