@@ -40,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+", type=Path, help="folders of MeshGraphNets without material")
     parser.add_argument("--task", default="deformable_block")
-    parser.add_argument("--trajectories", type=int, default=45, help="spread over the validation split")
+    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
     add_dataset_options(parser)
     options = parser.parse_args()
     use_cpu(1)
