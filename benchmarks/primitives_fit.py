@@ -9,14 +9,12 @@ import json
 
 import numpy as np
 import torch
-from inputs import add_dataset_options, spread_cases
+from inputs import parse_for_validation
 
-from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case
 from m3gn_bench.m3gn import PrimitivesConfig
 from m3gn_bench.model import load_preset
 from m3gn_bench.movement_primitives import ProDMP
-from m3gn_bench.tasks import get_task
 
 TAUS = (0.4, 0.5, 0.7, 1.0, 1.65)
 
@@ -26,13 +24,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="falling_teddy")
     parser.add_argument("--preset", default="compact")
-    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
-    add_dataset_options(parser)
-    options = parser.parse_args()
-    use_cpu(1)
+    options, task, cases = parse_for_validation(parser)
 
-    task = get_task(options.task)
-    cases = spread_cases(task, "validation", options)
     config = load_preset("m3gn", options.preset, task).model
     assert isinstance(config, PrimitivesConfig)
     primitives = ProDMP(config.basis_functions, config.alpha, config.alpha_x)

@@ -11,19 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from inputs import add_dataset_options, spread_cases
+from inputs import parse_for_validation
 from scipy.spatial.transform import Rotation
 
 from m3gn_bench.checkpoint import load_checkpoint
-from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case, case_from
 from m3gn_bench.datasets.schema import DATASET_SEED, parse_key
 from m3gn_bench.generators.falling import FallParameters
 from m3gn_bench.generators.generate import draw
 from m3gn_bench.generators.scene import get_scene
 from m3gn_bench.leaderboard.record import checkpoint_folder
-from m3gn_bench.leaderboard.summary import middle
-from m3gn_bench.tasks import Task, get_task
+from m3gn_bench.tasks import Task
 
 TURN = np.radians(0.1)
 PARTS = ("level", "upright", "turn", "shape")
@@ -36,14 +34,9 @@ def main() -> None:
     parser.add_argument(
         "--models", default="m3gn,mgn,mango,egno,stand_still", help="that ship with the project"
     )
-    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
-    add_dataset_options(parser)
-    options = parser.parse_args()
-    use_cpu(1)
+    options, task, cases = parse_for_validation(parser)
 
-    task = get_task(options.task)
-    context = middle(task.context_sizes)
-    cases = spread_cases(task, "validation", options)
+    context = task.middle_context
     rows = []
     for name in options.models.split(","):
         model, _ = load_checkpoint(checkpoint_folder(task.name, name, "compact"), task)

@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from inputs import add_dataset_options, spread_cases
+from inputs import parse_for_validation
 from torch import Tensor
 
 from m3gn_bench.baselines.mgn import MeshGraphNet, State
 from m3gn_bench.checkpoint import load_checkpoint
-from m3gn_bench.cpu import use_cpu
 from m3gn_bench.data import Case
-from m3gn_bench.leaderboard.summary import middle
-from m3gn_bench.tasks import get_task
 
 WAYS = {
     "single steps": (True, True),
@@ -40,14 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+", type=Path, help="folders of MeshGraphNets without material")
     parser.add_argument("--task", default="deformable_block")
-    parser.add_argument("--trajectories", type=int, default=20, help="spread over the validation split")
-    add_dataset_options(parser)
-    options = parser.parse_args()
-    use_cpu(1)
+    options, task, cases = parse_for_validation(parser)
 
-    task = get_task(options.task)
-    context = middle(task.context_sizes)
-    cases = spread_cases(task, "validation", options)
+    context = task.middle_context
     rows = []
     for folder in options.checkpoints:
         model, description = load_checkpoint(folder, task)

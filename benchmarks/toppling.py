@@ -21,7 +21,6 @@ from m3gn_bench.cpu import use_cpu
 from m3gn_bench.datasets.reader import TrajectoryDataset
 from m3gn_bench.datasets.trajectory import Trajectory
 from m3gn_bench.generators.scene import get_scene
-from m3gn_bench.leaderboard.summary import middle
 from m3gn_bench.sources import find_or_generate
 from m3gn_bench.tasks import Task, get_task
 
@@ -38,7 +37,7 @@ def main() -> None:
     use_cpu(1)
 
     task = get_task(options.task)
-    context = middle(task.context_sizes)
+    context = task.middle_context
     path = find_or_generate(task, options.tier, options.data, splits=("train", "validation"))
     (inputs, paths), (asked, wanted) = (
         level_paths(task, TrajectoryDataset(path, task.name, split, options.tier), context)

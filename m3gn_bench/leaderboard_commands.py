@@ -150,7 +150,6 @@ def pictures(
     from m3gn_bench.leaderboard.pictures import draw_latents, draw_overlays
     from m3gn_bench.leaderboard.record import HOME, checkpoint_folder, read_records
     from m3gn_bench.leaderboard.render import PICTURES
-    from m3gn_bench.leaderboard.summary import middle
     from m3gn_bench.m3gn import M3GN
     from m3gn_bench.sources import find_or_generate
     from m3gn_bench.tasks import TASKS, get_task
@@ -175,7 +174,7 @@ def pictures(
         model, _ = load_checkpoint(checkpoint_folder(name, "m3gn", m3gn.preset, m3gn.seed, folder))
         assert isinstance(model, M3GN)
         cases = load_cases(path, task, "test", tier)
-        save(draw_latents(model, cases, middle(task.context_sizes)), output / f"latent-{name}.png")
+        save(draw_latents(model, cases, task.middle_context), output / f"latent-{name}.png")
         written += [str(output / f"{kind}-{name}.png") for kind in PICTURES]
     report.finish({"files": written}, *written, f"{len(written)} pictures")
 
